@@ -174,7 +174,7 @@ class DetailClip:
         Excludes pixels masked as no part of the scene, such as a burnt-in logo, because the freeze removes them.
         """
         own, frozen = self.mattes(frame, t_star, view)
-        ignored = self.compositor.seen.view(frame).ignored
+        ignored = self.compositor.source_views.view(frame).ignored
         masked = None if ignored is None else resized(ignored[..., 0], self.width, self.height) > 0.0
         return still_pixels(own, frozen > 0.75) if masked is None else still_pixels(own, frozen > 0.75) & ~masked
 

@@ -92,7 +92,7 @@ def collect(truth: TruthScene, run: str, name: str, t_stars: Sequence[int], ever
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             rows.append(_row(clip, truth, pose, t_star))
     found, plate, filled, target, moving = (torch.stack(column) for column in zip(*rows, strict=True))
-    return Case(name, found, plate, filled, target, moving, clip.compositor.seen.unit)
+    return Case(name, found, plate, filled, target, moving, clip.compositor.source_views.unit)
 
 
 @torch.no_grad()
@@ -101,9 +101,9 @@ def _row(clip: DetailClip, truth: TruthScene, pose: int, t_star: int) -> tuple[T
     filled = clip.view(pose, t_star, (pose,), image).picture
     compositor, frozen = clip.compositor, clip.frozen(t_star)
     output = OutputFrame(pose, *clip.camera(pose), float(t_star), float(pose))
-    target = target_view(compositor.seen, output, frozen, image, clip.width, clip.height)
-    seen, instant = (compositor.seen.seen(frame, target.points) for frame in (pose, t_star))
-    found = evidence(compositor.seen, target, pose, seen, instant, compositor.config.state)
+    target = target_view(compositor.source_views, output, frozen, image, clip.width, clip.height)
+    seen, instant = (compositor.source_views.seen(frame, target.points) for frame in (pose, t_star))
+    found = evidence(compositor.source_views, target, pose, seen, instant, compositor.config.state)
     h, w = target.depth.shape
     pictures = (clip.plate(pose), filled, truth.truth(t_star, pose, clip.width, clip.height))
     moving = truth.regions(t_star, pose, clip.width, clip.height)["moving"]

@@ -101,7 +101,7 @@ def watch(trainer: Trainer, parts: Parts) -> None:
         (trainer, "_observe", "what a frame tells of the Gaussians"),
         (trainer, "_schedule_rates", "learning rates"),
         (events, "schedule_events", "densification and gate"),
-        (trainer, "_told", "what the step is told"),
+        (trainer, "_step_inputs", "inputs of the step"),
     ):
         patch(owner, name, label)
     if model.field is not None:

@@ -55,7 +55,7 @@ from .freeze.views.source_views import VisibilityConfig, motion_mattes
 from .scene import Scene, load_scene
 from .shot import Shot
 from .train import LoadedRun, load_run
-from .train.device import decide_device, unused_words
+from .train.device import decide_device, unused_warning
 
 _INSTANTS_KEPT = 8
 """Number of frozen scenes kept in memory, so that a return to an instant needs no evaluation of the field."""
@@ -136,7 +136,7 @@ class LiveSession:
 
     def __init__(self, shot: Shot, run: str, device: str = "auto") -> None:
         chosen, unused = decide_device(device)
-        self._note = " ".join(unused_words(unused, "Scrubbing")).strip() if unused is not None else ""
+        self._note = " ".join(unused_warning(unused, "Scrubbing")).strip() if unused is not None else ""
         self._shot, self.run = shot, load_run(shot, run, chosen)
         self.scene = load_scene(shot)
         self._span = span_of(self.scene, self.run)

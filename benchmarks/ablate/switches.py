@@ -125,7 +125,7 @@ _SCENE = (
     ),
     Rule(
         "movers alone", "no second training of movers", "develop",
-        (Switch("instant.develop", "_FineTuning._movers_alone", _as_it_was),),
+        (Switch("instant.develop", "_FineTuning._movers_only", _as_it_was),),
     ),
 )  # fmt: skip
 STATE = (
@@ -143,7 +143,10 @@ _FILL = (
         "agreed", "plates of other times need not agree with t*",
         switches=(Switch("composite.fill", "_agreed", _everywhere),),
     ),
-    Rule("rough", "single pixels of a plate count", switches=(Switch("composite.fill", "_shown", _everywhere),)),
+    Rule(
+        "rough", "single pixels of a plate count",
+        switches=(Switch("composite.fill", "_visible_surroundings", _everywhere),),
+    ),
     Rule(
         "plate t*'s pixels", "plate t* gives residuals alone",
         switches=(Switch("composite.fill", "_take_instant", _none),),

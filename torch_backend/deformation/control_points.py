@@ -111,10 +111,10 @@ class ControlPointsConfig(HostConfig):
 
 def _reference(iterations: int) -> ControlPointsConfig:
     """Configuration of the published host: stage one takes 10,000 of 80,000 steps; rates as published (see Host B)."""
-    whole = float(PUBLISHED_ITERATIONS)
+    total_steps = float(PUBLISHED_ITERATIONS)
     return ControlPointsConfig(
         start=0.0,
-        detached=13_000 / whole,
+        detached=13_000 / total_steps,
         nodes=512,
         hyper=8,
         depth=8,
@@ -124,16 +124,16 @@ def _reference(iterations: int) -> ControlPointsConfig:
         published=True,
         lr=5 * 1.6e-4,
         lr_end=1.6e-6,
-        until=50_000 / whole,
+        until=50_000 / total_steps,
         lr_nodes=8e-4,
         lr_hyper=2.5e-3,
         arap=1e-4,
         arap_end=1e-5,
-        arap_fall=(15_000 / whole, 20_000 / whole),
-        arap_until=30_000 / whole,
+        arap_fall=(15_000 / total_steps, 20_000 / total_steps),
+        arap_until=30_000 / total_steps,
         noise=0.1,
-        noise_until=30_000 / whole,
-        rehearsal=10_000 / whole,
+        noise_until=30_000 / total_steps,
+        rehearsal=10_000 / total_steps,
     )
 
 
@@ -177,7 +177,7 @@ class ControlPoints(Deformation):
         self.owned = {"hyper": Owned((config.hyper,), -1e-2, config.lr_hyper, 0.1 * config.lr_hyper)}
 
     @property
-    def apart(self) -> bool:
+    def has_separate_calls(self) -> bool:
         """True: Gaussians at one time share the motion of the nodes, which is computed once per node."""
         return True
 
@@ -188,13 +188,13 @@ class ControlPoints(Deformation):
 
     # ------------------------------------------------------------------ motion
 
-    def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
+    def forward(self, means: Tensor, times: Tensor, host_params: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] in scene units (detached), times [M] or [1] in [0, 1].
 
-        own: hyper [M, H]; without it, every Gaussian has the initial value.
+        host_params: hyper [M, H]; without it, every Gaussian has the initial value.
         """
         x = means.detach()
-        hyper = (own or {}).get("hyper")
+        hyper = (host_params or {}).get("hyper")
         if hyper is None:
             hyper = x.new_full((len(x), self.config.hyper), self.owned["hyper"].value)
         index, share = self._skin(x, hyper)
@@ -213,11 +213,11 @@ class ControlPoints(Deformation):
         with torch.no_grad():
             joint, nodes = torch.cat([x, hyper], dim=1), torch.cat([self.places, self.hyper], dim=1)
             index = nearest(joint, nodes, min(_FOLLOWED, len(nodes)))
-            away = (x[:, None] - self.places[index]).square().sum(2)
+            squared_distance = (x[:, None] - self.places[index]).square().sum(2)
         reach, weight = -0.5 * torch.exp(-2.0 * self.log_radii), torch.sigmoid(self.weights)
-        each = F.embedding(index, torch.cat([self.hyper, reach[:, None], weight[:, None]], dim=1))
-        squared = away + (hyper[:, None] - each[..., :-2]).square().sum(2)
-        share = torch.exp(squared * each[..., -2]) * each[..., -1] + 1e-7
+        node_params = F.embedding(index, torch.cat([self.hyper, reach[:, None], weight[:, None]], dim=1))
+        squared = squared_distance + (hyper[:, None] - node_params[..., :-2]).square().sum(2)
+        share = torch.exp(squared * node_params[..., -2]) * node_params[..., -1] + 1e-7
         return index, share / share.sum(1, keepdim=True)
 
     def _motions(self, index: Tensor, times: Tensor) -> tuple[Tensor, _Motion, Tensor]:
@@ -228,7 +228,7 @@ class ControlPoints(Deformation):
         if times.shape[0] == 1:
             return self.places, self.node_motion(self.places, times), index
         if index.device.type != "cpu":
-            # Removing duplicates would synchronise with the GPU. `apart` keeps the number of these rows small.
+            # Removing duplicates would synchronise with the GPU. `has_separate_calls` keeps these rows few.
             rows = torch.arange(index.numel(), device=index.device).view_as(index)
             places = self.places[index.flatten()]
             return places, self.node_motion(places, times.repeat_interleave(index.shape[1])), rows
@@ -239,11 +239,11 @@ class ControlPoints(Deformation):
 
     def node_motion(self, places: Tensor, times: Tensor) -> _Motion:
         """Motion of nodes at places [R, 3] (detached) and times [R] or [1], by the network."""
-        where, when = places.detach(), times
+        positions = places.detach()
         if not self.config.published:
-            where = 2.0 * (where - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
-            when = 2.0 * when - 1.0
-        hidden = self.trunk(where, when)
+            positions = 2.0 * (positions - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
+            times = 2.0 * times - 1.0
+        hidden = self.trunk(positions, times)
         out = {name: head(hidden) for name, head in self.heads.items()}
         return _Motion(out["means"], out.get("frame", out["quats"]), out["quats"], out["log_scales"])
 
@@ -262,11 +262,11 @@ class ControlPoints(Deformation):
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Two groups: the nodes and the network. In the published configuration, the nodes' rate does not decay."""
         c = self.config
-        own = [self.hyper, self.log_radii, self.weights]
+        nodes = [self.hyper, self.log_radii, self.weights]
         network = [*self.trunk.parameters(), *self.heads.parameters()]
         end = c.lr_nodes if c.published else 0.1 * c.lr_nodes
         return [
-            {"params": own, "lr": c.lr_nodes, "lr_end": end, "name": "nodes"},
+            {"params": nodes, "lr": c.lr_nodes, "lr_end": end, "name": "nodes"},
             {
                 "params": network,
                 "lr": c.lr,
@@ -284,8 +284,8 @@ class ControlPoints(Deformation):
             return self.places.new_zeros(())
         places = self.places
         if len(places) > 512:
-            drawn = torch.randperm(len(places), generator=generator, device="cpu")[:512]
-            places = places[drawn.to(places.device, non_blocking=True)]
+            sample = torch.randperm(len(places), generator=generator, device="cpu")[:512]
+            places = places[sample.to(places.device, non_blocking=True)]
         times = _near_times(2, _WINDOW, generator).to(places.device, non_blocking=True)
         return weight * arap_energy(*self.trajectories(places, times))
 
@@ -452,8 +452,12 @@ class _Surrogates:
     @torch.no_grad()
     def _multiply(self, rounds: int) -> None:
         """Drops transparent surrogates, and adds copies near those with the largest gradients."""
-        shown = torch.sigmoid(self.params["opacity_logits"]) >= _PRUNED
-        kept = torch.nonzero(shown).flatten() if bool(shown.any()) else torch.arange(len(shown), device=shown.device)
+        is_visible = torch.sigmoid(self.params["opacity_logits"]) >= _PRUNED
+        kept = (
+            torch.nonzero(is_visible).flatten()
+            if bool(is_visible.any())
+            else torch.arange(len(is_visible), device=is_visible.device)
+        )
         more = min(len(kept), max(0, self.limit - len(kept)) // rounds)
         parents = kept[self.pull[kept].topk(more).indices]
         spread = torch.randn(more, 3, generator=self.stage.generator, device="cpu").to(parents.device)

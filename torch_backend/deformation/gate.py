@@ -32,7 +32,7 @@ class GateConfig:
 
     WIDTH: ClassVar[int] = 320
     """Image width to which `pixels` refers, independent of the training resolution."""
-    STRAY: ClassVar[tuple[float, int]] = 0.25, 2
+    STAY_OPEN: ClassVar[tuple[float, int]] = 0.25, 2
     """(share, frames): in a long run, a Gaussian stays open if at least `share` of its contribution falls on moving
     pixels in at least `frames` frames. Opening requires more, but mattes miss much of an arm."""
     LONG: ClassVar[int] = 3000

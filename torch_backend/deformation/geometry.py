@@ -34,10 +34,10 @@ def quat_product(a: Tensor, b: Tensor) -> Tensor:
 
 def near_identity(change: Tensor) -> Tensor:
     """Unit quaternions [..., 4]: (1, 0, 0, 0) + `change`, normalised; the identity where the sum is 0."""
-    one = torch.zeros_like(change)
-    one[..., 0] = 1.0
-    quats = one + change
-    return F.normalize(torch.where(quats.square().sum(-1, keepdim=True) < 1e-12, one, quats), dim=-1)
+    identity = torch.zeros_like(change)
+    identity[..., 0] = 1.0
+    quats = identity + change
+    return F.normalize(torch.where(quats.square().sum(-1, keepdim=True) < 1e-12, identity, quats), dim=-1)
 
 
 def screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
@@ -46,11 +46,11 @@ def screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
     Deformable 3DGS divides by the angle and returns NaN at 0. This function uses series near 0.
     """
     a, b, c = _quotients(turn.square().sum(1, keepdim=True))
-    rotated = points + a * cross(turn, points) + b * _twice(turn, points)
-    return rotated + shift + b * cross(turn, shift) + c * _twice(turn, shift)
+    rotated = points + a * cross(turn, points) + b * _double_cross(turn, points)
+    return rotated + shift + b * cross(turn, shift) + c * _double_cross(turn, shift)
 
 
-def _twice(turn: Tensor, v: Tensor) -> Tensor:
+def _double_cross(turn: Tensor, v: Tensor) -> Tensor:
     return cross(turn, cross(turn, v))
 
 

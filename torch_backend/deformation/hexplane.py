@@ -85,9 +85,9 @@ class HexPlaneConfig(HostConfig):
 
 def _reference(iterations: int) -> HexPlaneConfig:
     """Published host in the size of its Splannequin configuration: 3000 static steps, then 30,000 with the field."""
-    scale, whole = _EXTENT * rate_scale(PUBLISHED_ITERATIONS, iterations), float(PUBLISHED_ITERATIONS)
+    scale, total_steps = _EXTENT * rate_scale(PUBLISHED_ITERATIONS, iterations), float(PUBLISHED_ITERATIONS)
     return HexPlaneConfig(
-        start=3000 / whole,
+        start=3000 / total_steps,
         time_nodes=150,
         width=128,
         lr_grid=1.6e-3 * scale,
@@ -99,7 +99,7 @@ def _reference(iterations: int) -> HexPlaneConfig:
         space_range=(0.1, 0.5),
         time_spread=0.0,
         silu=False,
-        until=23_000 / whole,
+        until=23_000 / total_steps,
         stretch=0.0,
         published=True,
     )
@@ -157,7 +157,7 @@ class HexPlane(Deformation):
         widths = {**_WIDTHS, "shN": 3 * harmonics} if config.published and harmonics else _WIDTHS
         self.hidden = nn.ModuleDict({name: _linear(config.width, config.width, generator) for name in widths})
         self.out = nn.ModuleDict({n: nn.Linear(config.width, size, device="cpu") for n, size in widths.items()})
-        self._held: _InOrder | None = None
+        self._cached: _InOrder | None = None
         for head in self.out.values():
             if config.published:
                 nn.init.xavier_uniform_(head.weight, generator=generator)  # type: ignore[arg-type]
@@ -169,18 +169,18 @@ class HexPlane(Deformation):
         """[M, features * levels] products of the samples of six planes, concatenated over levels."""
         means = means if self.config.published else means.detach()
         low, high = self._rim
-        where = 2.0 * (self._stretched(means) - low) / (high - low) - 1.0
-        when = (times if self.config.published else 2.0 * times - 1.0).expand(len(means))
+        positions = 2.0 * (self._stretched(means) - low) / (high - low) - 1.0
+        plane_times = (times if self.config.published else 2.0 * times - 1.0).expand(len(means))
         planes = self._by_level()
-        if compiled.supports(planes) and where.dtype == torch.float32:
-            return compiled.features(torch.cat([where, when[:, None]], dim=1), planes)
+        if compiled.supports(planes) and positions.dtype == torch.float32:
+            return compiled.features(torch.cat([positions, plane_times[:, None]], dim=1), planes)
         parts: list[Tensor] = []
         for level in range(len(self.config.levels)):
-            product = where.new_ones(())
+            product = positions.new_ones(())
             for k, (a, b) in enumerate(_SPATIAL):
-                product = product * _sample(self.spatial[3 * level + k], where[:, a], where[:, b])
+                product = product * _sample(self.spatial[3 * level + k], positions[:, a], positions[:, b])
             for axis in range(3):
-                product = product * _sample(self.temporal[3 * level + axis], where[:, axis], when)
+                product = product * _sample(self.temporal[3 * level + axis], positions[:, axis], plane_times)
             parts.append(product)
         return torch.cat(parts, dim=1)
 
@@ -193,7 +193,7 @@ class HexPlane(Deformation):
         super().load_state(tensors)
         self._rim.copy_(self._stretched(self.box))
 
-    def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
+    def forward(self, means: Tensor, times: Tensor, host_params: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] scene units (detached unless `published`), times [M] or [1] in [0, 1]."""
         out = dict(zip(self.out, self._network(self.features_at(means, times)), strict=True))
         return Deltas(
@@ -225,14 +225,14 @@ class HexPlane(Deformation):
 
     def _in_order(self) -> _InOrder:
         """Cached parameter lists. Lookups by name in torch's lists took 1/15 of the CPU time of a step on a GPU."""
-        if self._held is None or self._held.trunk.weight is not self.trunk.weight:
+        if self._cached is None or self._cached.trunk.weight is not self.trunk.weight:
             levels = range(0, len(self.spatial), 3)
-            self._held = _InOrder(
+            self._cached = _InOrder(
                 [plane for n in levels for plane in (*self.spatial[n : n + 3], *self.temporal[n : n + 3])],
                 _layer(self.trunk),
                 [(_layer(self.hidden[name]), _layer(self.out[name])) for name in self.out],
             )
-        return self._held
+        return self._cached
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Two groups: planes and network. In the published configuration, their schedule begins with the field."""

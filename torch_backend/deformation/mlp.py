@@ -134,10 +134,10 @@ class Trunk(nn.Module):
                 nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)  # type: ignore[arg-type]
                 nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
 
-    def forward(self, where: Tensor, when: Tensor) -> Tensor:
-        """[M, width] features at positions `where` [M, 3] and times `when` [M] or [1]."""
-        moment = encode(when[:, None], self.octaves[1]).expand(len(where), -1)
-        inputs = torch.cat([encode(where, self.octaves[0]), moment], dim=1)
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """[M, width] features at `positions` [M, 3] and `times` [M] or [1]."""
+        moment = encode(times[:, None], self.octaves[1]).expand(len(positions), -1)
+        inputs = torch.cat([encode(positions, self.octaves[0]), moment], dim=1)
         hidden = inputs
         for n, layer in enumerate(self.layers):
             hidden = F.relu(layer(hidden))
@@ -165,13 +165,13 @@ class Mlp(Deformation):
         self.heads = nn.ModuleDict({n: linear(config.width, size, generator, std) for n, size in widths.items()})
         self.rules = {"quats": add_to_unit_quat, "log_scales": add_to_scale} if config.published else {"quats": turn}
 
-    def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
+    def forward(self, means: Tensor, times: Tensor, host_params: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] in scene units (detached), times [M] or [1] in [0, 1]."""
-        where, when = means.detach(), times
+        positions = means.detach()
         if not self.config.published:
-            where = 2.0 * (where - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
-            when = 2.0 * when - 1.0
-        hidden = self.trunk(where, when)
+            positions = 2.0 * (positions - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
+            times = 2.0 * times - 1.0
+        hidden = self.trunk(positions, times)
         shift = self.heads["means"](hidden)
         if self.config.six_dof:
             middle = self.box.mean(0)

@@ -85,13 +85,13 @@ class _Packed(NamedTuple):
 
 def _packed(params: Sequence[Tensor]) -> _Packed:
     """Packs `params`: weight and bias of the trunk, then for each head those of the hidden and of the last layer."""
-    trunk, trunk_b, *rest = params
-    hidden, hidden_b = torch.stack(rest[0::4]), torch.stack(rest[1::4])
+    trunk, trunk_b, *heads = params
+    hidden, hidden_b = torch.stack(heads[0::4]), torch.stack(heads[1::4])
     out = torch.zeros(len(hidden), _PAD, trunk.shape[0], device="cpu")
     out_b = torch.zeros(len(hidden), _PAD, device="cpu")
-    for head, (weight, bias) in enumerate(zip(rest[2::4], rest[3::4], strict=True)):
+    for head, (weight, bias) in enumerate(zip(heads[2::4], heads[3::4], strict=True)):
         out[head, : len(bias)], out_b[head, : len(bias)] = weight, bias
-    sizes = torch.tensor([len(bias) for bias in rest[3::4]], dtype=torch.int64, device="cpu")
+    sizes = torch.tensor([len(bias) for bias in heads[3::4]], dtype=torch.int64, device="cpu")
     turned = (t.transpose(-1, -2).contiguous() for t in (trunk, hidden, out))
     trunk_t, hidden_t, out_t = turned
     return _Packed(trunk.contiguous(), trunk_t, trunk_b, hidden, hidden_t, hidden_b, out, out_t, out_b, sizes)
@@ -142,9 +142,9 @@ class _Network(torch.autograd.Function):
         sizes = _sizes(packed)
         partial, sums = torch.empty(units, sum(sizes), device="cpu"), torch.empty(sum(sizes), device="cpu")
         dx = torch.empty_like(features)
-        held = {"partial": partial, "units": units}
-        _run(1, ctx.threads, packed, x=features, dx=dx, pulls=_table(pulls), count=count, rows=rows, **held)
-        _run(2, ctx.threads, packed, sums=sums, **held)
+        shared = {"partial": partial, "units": units}
+        _run(1, ctx.threads, packed, x=features, dx=dx, pulls=_table(pulls), count=count, rows=rows, **shared)
+        _run(2, ctx.threads, packed, sums=sums, **shared)
         found: list[Tensor] = []
         for n, (part, param) in enumerate(zip(split(sums, sizes), params, strict=True)):
             if n >= 2 and n % 4 == 0:  # weights of a last layer are transposed and padded

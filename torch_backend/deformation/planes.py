@@ -83,18 +83,18 @@ class _Product(torch.autograd.Function):
     """Features of points, with gradients for the planes and the points."""
 
     @staticmethod
-    def forward(ctx: _Sampling, where: Tensor, threads: int | None, *planes: Tensor) -> Tensor:
-        count, channels, levels = len(where), planes[0].shape[1], len(planes) // 6
+    def forward(ctx: _Sampling, positions: Tensor, threads: int | None, *planes: Tensor) -> Tensor:
+        count, channels, levels = len(positions), planes[0].shape[1], len(planes) // 6
         features = torch.empty(count, levels * channels, device="cpu")
         differentiable = any(ctx.needs_input_grad)
         samples = torch.empty(len(planes), count, channels, device="cpu") if differentiable else None
         pointers, sizes = _table(planes), _sizes(planes)
         _sampler(channels).run(
-            threads, planes=pointers.data_ptr(), grads=0, sizes=sizes.data_ptr(), where=where.data_ptr(),
+            threads, planes=pointers.data_ptr(), grads=0, sizes=sizes.data_ptr(), where=positions.data_ptr(),
             samples=0 if samples is None else samples.data_ptr(), features=features.data_ptr(), pulls=0, count=count,
             levels=levels,
         )  # fmt: skip
-        ctx.save_for_backward(where, samples, *planes)
+        ctx.save_for_backward(positions, samples, *planes)
         ctx.threads = threads
         return features
 
@@ -102,32 +102,32 @@ class _Product(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: _Sampling, *grads_in: Tensor) -> tuple[Tensor | None, ...]:
         saved: tuple[Tensor, ...] = ctx.saved_tensors  # read once: under checkpointing, each access recomputes them
-        where, samples, *planes = saved
+        positions, samples, *planes = saved
         out = [torch.empty_like(p) for p in planes]
         grad = grads_in[0].contiguous()
-        pulls = torch.empty_like(where) if ctx.needs_input_grad[0] else None
+        pulls = torch.empty_like(positions) if ctx.needs_input_grad[0] else None
         pointers, grads, sizes = _table(planes), _table(out), _sizes(planes)
         for stage in (1,) if pulls is None else (1, 2):
             _sampler(planes[0].shape[1]).run(
                 ctx.threads, stage, planes=pointers.data_ptr(), grads=grads.data_ptr(), sizes=sizes.data_ptr(),
-                where=where.data_ptr(), samples=samples.data_ptr(), features=grad.data_ptr(),
-                pulls=0 if pulls is None else pulls.data_ptr(), count=len(where), levels=len(planes) // 6,
+                where=positions.data_ptr(), samples=samples.data_ptr(), features=grad.data_ptr(),
+                pulls=0 if pulls is None else pulls.data_ptr(), count=len(positions), levels=len(planes) // 6,
             )  # fmt: skip
         return pulls, None, *out
 
 
-def features(where: Tensor, planes: Sequence[Tensor], threads: int | None = None) -> Tensor:
+def features(positions: Tensor, planes: Sequence[Tensor], threads: int | None = None) -> Tensor:
     """[M, levels * C] products of bilinear samples of each level's six planes, differentiable in both arguments.
 
-    where: [M, 4] x, y, z and time in [-1, 1]; values outside are clamped, without gradient.
+    positions: [M, 4] x, y, z and time in [-1, 1]; values outside are clamped, without gradient.
     planes: [1, C, rows, columns] each, six per level, of axes xy, xz, yz, xt, yt, zt (the first axis along a row).
     ValueError unless `supports` accepts the planes.
     """
     if planes[0].is_cuda:
-        return planes_cuda.features(where, planes)
+        return planes_cuda.features(positions, planes)
     if not supports(planes):
         raise ValueError("planes should be float32 on the CPU, channels last, with a multiple of 16 features")
-    return applied(_Product, where.float().contiguous(), threads, *planes)
+    return applied(_Product, positions.float().contiguous(), threads, *planes)
 
 
 class _Bend(torch.autograd.Function):

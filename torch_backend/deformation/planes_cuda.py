@@ -117,38 +117,38 @@ class _Product(torch.autograd.Function):
     """Features of points, with gradients for the planes and the points."""
 
     @staticmethod
-    def forward(ctx: AutogradContext, where: Tensor, *planes: Tensor) -> Tensor:
+    def forward(ctx: AutogradContext, positions: Tensor, *planes: Tensor) -> Tensor:
         channels, levels = planes[0].shape[1], len(planes) // 6
-        features = where.new_empty(len(where), levels * channels)
+        features = positions.new_empty(len(positions), levels * channels)
         width = 4 if channels % 4 == 0 else 1
-        inputs = [_table(planes).data_ptr(), where.data_ptr(), 0, features.data_ptr(), levels]
-        launch_on(kernels(channels).samples, features.numel() // width, inputs, where.device)
-        ctx.save_for_backward(where, *planes)
+        inputs = [_table(planes).data_ptr(), positions.data_ptr(), 0, features.data_ptr(), levels]
+        launch_on(kernels(channels).samples, features.numel() // width, inputs, positions.device)
+        ctx.save_for_backward(positions, *planes)
         return features
 
     @staticmethod
     @once_differentiable
     def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor | None, ...]:
         saved: tuple[Tensor, ...] = ctx.saved_tensors
-        where, *planes = saved
+        positions, *planes = saved
         channels, levels, pull = planes[0].shape[1], len(planes) // 6, grads[0].contiguous()
-        made, table = kernels(channels), _table(planes)
-        flat = where.new_zeros(sum(p.numel() for p in planes))
-        inputs = [table.data_ptr(), where.data_ptr(), pull.data_ptr(), flat.data_ptr(), levels]
-        launch_on(made.gradients, pull.numel(), inputs, where.device)
+        compiled, table = kernels(channels), _table(planes)
+        flat = positions.new_zeros(sum(p.numel() for p in planes))
+        inputs = [table.data_ptr(), positions.data_ptr(), pull.data_ptr(), flat.data_ptr(), levels]
+        launch_on(compiled.gradients, pull.numel(), inputs, positions.device)
         points = None
         if ctx.needs_input_grad[0]:
-            points = torch.empty_like(where)
-            inputs = [table.data_ptr(), where.data_ptr(), pull.data_ptr(), points.data_ptr(), levels]
-            launch_on(made.points, len(where), inputs, where.device)
+            points = torch.empty_like(positions)
+            inputs = [table.data_ptr(), positions.data_ptr(), pull.data_ptr(), points.data_ptr(), levels]
+            launch_on(compiled.points, len(positions), inputs, positions.device)
         return points, *_like(flat, planes)
 
 
-def features(where: Tensor, planes: Sequence[Tensor]) -> Tensor:
+def features(positions: Tensor, planes: Sequence[Tensor]) -> Tensor:
     """See `planes.features`, for planes on a GPU. ValueError unless `supports` accepts the planes."""
     if not supports(planes):
         raise ValueError("planes should be float32 on one device, channels last, and aligned to 16 bytes")
-    return applied(_Product, where.float().contiguous(), *planes)
+    return applied(_Product, positions.float().contiguous(), *planes)
 
 
 class _Bend(torch.autograd.Function):

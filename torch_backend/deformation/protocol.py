@@ -146,13 +146,13 @@ class Deformation(nn.Module):
     rules: Mapping[str, Rule]
     """Rules that combine deltas with canonical parameters, by parameter name; others are added."""
     owned: Mapping[str, Owned]
-    """Parameters per Gaussian that belong to the host, by name; calls receive their rows as `own`."""
+    """Parameters per Gaussian that belong to the host, by name; calls receive their rows as `host_params`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.rules, self.owned = {}, {}
 
-    def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
+    def forward(self, means: Tensor, times: Tensor, host_params: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians: canonical means [M, 3] in scene units, times [M] or [1] in [0, 1], owned rows."""
         raise NotImplementedError
 
@@ -173,7 +173,7 @@ class Deformation(nn.Module):
         raise NotImplementedError
 
     @property
-    def apart(self) -> bool:
+    def has_separate_calls(self) -> bool:
         """True if, on a GPU, many Gaussians at one time and few at other times are cheaper in two calls than in one."""
         return False
 
@@ -246,10 +246,10 @@ def apply_deltas(
     if deltas is None or len(rows) == 0:
         return state
     # Indexing takes ten times as long as the sum, and is skipped if all rows move. On a GPU the test would synchronise.
-    whole = len(rows) == len(model) and rows.device.type == "cpu" and bool((rows[1:] > rows[:-1]).all())
+    moves_all = len(rows) == len(model) and rows.device.type == "cpu" and bool((rows[1:] > rows[:-1]).all())
     for name, delta in deltas.moved().items():
         rule = (rules or {}).get(name)
-        if whole:
+        if moves_all:
             state[name] = state[name] + delta if rule is None else rule(state[name], delta)
         elif rule is None:
             state[name] = state[name].index_add(0, rows, delta)

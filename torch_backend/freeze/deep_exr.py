@@ -12,7 +12,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from .exr import HALF_MAX, ROWS, FrameMetadata, frame_spec, set_margin, write_beside
+from .exr import HALF_MAX, ROWS, FrameMetadata, frame_spec, set_margin, write_picture
 
 DEEP_CHANNELS = ("R", "G", "B", "A", "Z")
 """Channels of a deep frame. Without ZBack, a sample is a surface, not a volume."""
@@ -49,7 +49,7 @@ def write_deep_exr(
         begin, end = spec.y + part.start, spec.y + part.stop
         return bool(output.write_deep_scanlines(begin, end, 0, _deep_data(*samples(part))))
 
-    return write_beside(path, spec, rows)
+    return write_picture(path, spec, rows)
 
 
 def _deep_data(rgba: NDArray[np.float32], depth: NDArray[np.float32]) -> oiio.DeepData:

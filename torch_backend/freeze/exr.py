@@ -86,7 +86,7 @@ class FrameMetadata:
 
 
 class Rows(Protocol):
-    """A layer [H,W,...] that can be sliced by rows: an array or `Made`."""
+    """A layer [H,W,...] that can be sliced by rows: an array or `LazyLayer`."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...
@@ -95,7 +95,7 @@ class Rows(Protocol):
 
 
 @dataclass(frozen=True)
-class Made:
+class LazyLayer:
     """A layer that is computed while it is written, some rows at a time, to save memory."""
 
     shape: tuple[int, ...]
@@ -111,7 +111,7 @@ class Made:
 class DetailLayers:
     """Sources of the pixels of a frame that is composited from plates and splats."""
 
-    splat: ArrayLike | Made
+    splat: ArrayLike | LazyLayer
     """[H,W,4] scene-linear, premultiplied: the frame rendered from splats alone."""
     plate: ArrayLike
     """[H,W] in 0..1: share of the pixel that comes from plates. 0: all of it comes from splats."""
@@ -144,15 +144,15 @@ class FrozenFrame:
 
 def write_frozen_exr(
     path: str | Path,
-    rgba: ArrayLike | Made,  # [H,W,4]
-    depth: ArrayLike | Made,  # [H,W]
-    support: ArrayLike | Made,  # [H,W]
-    motion: ArrayLike | Made,  # [H,W]
+    rgba: ArrayLike | LazyLayer,  # [H,W,4]
+    depth: ArrayLike | LazyLayer,  # [H,W]
+    support: ArrayLike | LazyLayer,  # [H,W]
+    motion: ArrayLike | LazyLayer,  # [H,W]
     metadata: FrameMetadata,
     margin: tuple[int, int] = (0, 0),
-    grain: ArrayLike | Made | None = None,  # [H,W,3]
+    grain: ArrayLike | LazyLayer | None = None,  # [H,W,3]
     detail: DetailLayers | None = None,
-    more: Mapping[str, ArrayLike | Made] | None = None,  # [H,W] or [H,W,4]
+    more: Mapping[str, ArrayLike | LazyLayer] | None = None,  # [H,W] or [H,W,4]
 ) -> Path:
     """Writes one frame atomically: half colour and mattes, float32 depth and `source`, ZIP. Arrays as in `FrozenFrame`.
 
@@ -179,7 +179,7 @@ def write_frozen_exr(
 
     `more` holds other layers of `FRAME_LAYERS`, by name. KeyError if the table has no layer of that name.
 
-    Layers of type `Made` are computed while they are written. ValueError names the layer whose shape is wrong or that
+    `LazyLayer`s are computed while they are written. ValueError names the layer whose shape is wrong or that
     holds NaN or infinity; OSError if the file cannot be written (errno ENOSPC when the disk is full).
     """
     path = Path(path)
@@ -230,10 +230,10 @@ def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[Rows]) -> Path:
         begin = spec.y + top
         return bool(output.write_scanlines(begin, begin + len(values), 0, values))
 
-    return write_beside(path, spec, rows)
+    return write_picture(path, spec, rows)
 
 
-def write_beside(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bool]) -> Path:
+def write_picture(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bool]) -> Path:
     """Writes a picture atomically. `rows(output, top)` writes `ROWS` rows from row `top` and returns False on failure.
 
     OSError with the system's reason, as `write_frozen_exr`.
@@ -372,18 +372,18 @@ def _stored(name: str, layer: Rows, matrix: NDArray[np.float32] | None) -> Rows:
     """A layer as stored in the file: colours converted by `matrix` to the file's primaries, then rounded."""
     change = _STORED.get(name, lambda rows: rows)
     if matrix is not None and len(layer.shape) == 3 and (name not in _MORE or _MORE[name].is_colour):
-        return Made(layer.shape, lambda rows: change(in_light(layer[rows], matrix)))
-    return Made(layer.shape, lambda rows: change(layer[rows])) if name in _STORED else layer
+        return LazyLayer(layer.shape, lambda rows: change(in_light(layer[rows], matrix)))
+    return LazyLayer(layer.shape, lambda rows: change(layer[rows])) if name in _STORED else layer
 
 
-def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
+def _checked(layers: dict[str, ArrayLike | LazyLayer]) -> dict[str, Rows]:
     """The layers as float32, after checks of shape and finite values. ValueError names a bad layer.
 
-    All layers must have the size of `rgba`. Values of `Made` layers are checked when they are computed.
+    All layers must have the size of `rgba`. Values of `LazyLayer` layers are checked when they are computed.
     """
     with np.errstate(over="ignore"):
         found: dict[str, Rows] = {
-            name: layer if isinstance(layer, Made) else np.asarray(layer, dtype=np.float32)
+            name: layer if isinstance(layer, LazyLayer) else np.asarray(layer, dtype=np.float32)
             for name, layer in layers.items()
         }
     colour = found["rgba"].shape
@@ -394,19 +394,19 @@ def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
         expected = (*colour[:2], *_CHANNELS_OF.get(name, (colours,) if colours > 1 else ()))
         if tuple(layer.shape) != expected:
             raise ValueError(f"{name} should be {list(expected)} like rgba, got shape {list(layer.shape)}")
-        if isinstance(layer, Made):
-            found[name] = Made(layer.shape, functools.partial(_made, name, layer))
+        if isinstance(layer, LazyLayer):
+            found[name] = LazyLayer(layer.shape, functools.partial(_computed_rows, name, layer))
         elif isinstance(layer, np.ndarray):
             check_finite(name, cast(NDArray[Any], layer))
     return found
 
 
-def _made(name: str, layer: Made, rows: slice) -> NDArray[np.float32]:
+def _computed_rows(name: str, layer: LazyLayer, rows: slice) -> NDArray[np.float32]:
     """Some rows of a layer, float32. ValueError if a value is not finite."""
     with np.errstate(over="ignore"):
-        made = np.asarray(layer[rows], dtype=np.float32)
-    check_finite(name, made, rows.start)
-    return made
+        values = np.asarray(layer[rows], dtype=np.float32)
+    check_finite(name, values, rows.start)
+    return values
 
 
 def check_finite(name: str, layer: NDArray[np.float32], top: int = 0) -> None:

@@ -149,9 +149,9 @@ def render_frozen(
     del out  # frees the mean depth, which is large at 4K
     parts = bands(height, width)
     if len(parts) == 1:
-        color, alpha, support, motion = _shown(colors, alphas, exposure, exposed_at)
+        color, alpha, support, motion = _separated(colors, alphas, exposure, exposed_at)
         return FrozenImage(color, alpha, depth, support, motion).cpu()
-    made = FrozenImage(
+    image = FrozenImage(
         torch.empty(height, width, 3, device="cpu"),
         torch.empty(height, width, device="cpu"),
         depth.cpu(),
@@ -159,10 +159,10 @@ def render_frozen(
         torch.empty(height, width, device="cpu"),
     )
     for rows in parts:
-        color, alpha, support, motion = _shown(colors[rows], alphas[rows], exposure, exposed_at)
-        made.color[rows], made.alpha[rows] = color, alpha
-        made.support[rows], made.motion[rows] = support, motion
-    return made
+        color, alpha, support, motion = _separated(colors[rows], alphas[rows], exposure, exposed_at)
+        image.color[rows], image.alpha[rows] = color, alpha
+        image.support[rows], image.motion[rows] = support, motion
+    return image
 
 
 def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
@@ -174,7 +174,7 @@ def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
     return replace(frozen, state=state)
 
 
-def _shown(
+def _separated(
     colors: Tensor, alphas: Tensor, exposure: Exposure | None, exposed_at: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(color [h, w, 3], alpha, support, motion [h, w]) from rasterised rows: colors [h, w, 5], alphas [h, w]."""
@@ -202,11 +202,11 @@ class CandidateInstant:
     """Rank of the plate's sharpness among the trained frames, 0 (softest) to 1 (sharpest)."""
 
 
-def best_instants(instants: list[CandidateInstant], count: int = 5, apart: float = 0.08) -> list[CandidateInstant]:
-    """Up to `count` of a ranking, best first, at least the share `apart` of the trained frames from each other."""
+def best_instants(instants: list[CandidateInstant], count: int = 5, separation: float = 0.08) -> list[CandidateInstant]:
+    """Up to `count` of a ranking, best first, at least the share `separation` of the trained frames from each other."""
     chosen: list[CandidateInstant] = []
     for instant in sorted(instants, key=lambda i: -i.score):
-        if all(abs(instant.index - other.index) >= apart * len(instants) for other in chosen):
+        if all(abs(instant.index - previous.index) >= separation * len(instants) for previous in chosen):
             chosen.append(instant)
     return chosen[:count]
 

@@ -21,24 +21,24 @@ _CHUNK = 1 << 16
 """Number of Gaussians whose harmonics are rotated at once: their float64 copies take 25 MB."""
 
 
-def placed(gaussians: PlyGaussians, where: Similarity) -> PlyGaussians:
+def placed(gaussians: PlyGaussians, transform: Similarity) -> PlyGaussians:
     """Gaussians transformed by a similarity: they look the same from an equally transformed camera.
 
     Args:
         gaussians: as stored, float32.
-        where: similarity from the Gaussians' space to the new space.
+        transform: similarity from the Gaussians' space to the new space.
 
     Returns:
         float32 Gaussians; lengths of quaternions (wxyz) and the degree of harmonics are unchanged.
     """
-    turn = rotation_to_quat(where.rotation)
+    turn = rotation_to_quat(transform.rotation)
     sh = gaussians.sh
-    if sh.shape[1] > 1 and not np.array_equal(where.rotation, np.eye(3)):
-        sh = rotated_harmonics(sh, where.rotation)
+    if sh.shape[1] > 1 and not np.array_equal(transform.rotation, np.eye(3)):
+        sh = rotated_harmonics(sh, transform.rotation)
     return PlyGaussians(
-        where.points(gaussians.means).astype(np.float32),
+        transform.points(gaussians.means).astype(np.float32),
         _product(turn, gaussians.quats.astype(np.float64)).astype(np.float32),
-        (gaussians.log_scales + math.log(where.scale)).astype(np.float32),
+        (gaussians.log_scales + math.log(transform.scale)).astype(np.float32),
         gaussians.opacity_logits,
         sh,
     )

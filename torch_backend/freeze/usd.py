@@ -34,7 +34,7 @@ def write_usd(
     path: Path,
     gaussians: PlyGaussians | None,
     cameras: CameraPath,
-    where: Similarity,
+    transform: Similarity,
     metres_per_unit: float,
     fps: float,
 ) -> Path:
@@ -44,7 +44,7 @@ def write_usd(
         path: output file.
         gaussians: splats in the scene's axes and units; None: only the camera is written.
         cameras: the animated camera in solve units; its frame numbers become time codes of the stage.
-        where: similarity from solve units to the scene.
+        transform: similarity from solve units to the scene.
         metres_per_unit: length of a scene unit in metres.
         fps: frames per second.
 
@@ -68,7 +68,7 @@ def write_usd(
             stage: Any = Usd.Stage.Open(layer)
             _describe(stage, UsdGeom, cameras, metres_per_unit, fps)
             stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
-            _add_camera(UsdGeom.Camera.Define(stage, CAMERA), Gf, cameras, where, metres_per_unit)
+            _add_camera(UsdGeom.Camera.Define(stage, CAMERA), Gf, cameras, transform, metres_per_unit)
             if gaussians is not None:
                 _add_splats(UsdVol.ParticleField3DGaussianSplat.Define(stage, SPLATS), Vt, gaussians)
             written = layer.Export(str(partial), args={"format": path.suffix.removeprefix(".")})
@@ -93,10 +93,10 @@ def _describe(stage: Any, geometry: Any, cameras: CameraPath, metres_per_unit: f
     stage.SetEndTimeCode(cameras.frames[-1].frame)
 
 
-def _add_camera(camera: Any, vectors: Any, path: CameraPath, where: Similarity, metres_per_unit: float) -> None:
+def _add_camera(camera: Any, vectors: Any, path: CameraPath, transform: Similarity, metres_per_unit: float) -> None:
     """Adds keys for every frame of the path to a camera. USD film backs are in tenths of a stage unit."""
     per_mm = 0.01 / metres_per_unit
-    to_world = camera_to_world(where.viewmats(path_viewmats(path)))
+    to_world = camera_to_world(transform.viewmats(path_viewmats(path)))
     turns = camera.AddTransformOp()
     varying = {
         "focalLength": camera.CreateFocalLengthAttr(),

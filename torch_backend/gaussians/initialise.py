@@ -68,14 +68,14 @@ def initialise(
     opacity = torch.full((len(points),), config.opacity, device="cpu")
     if config.seeds > 0:
         picked = evenly_spaced(len(indices), config.frames)
-        each = min(config.seeds // len(picked), images.shape[1] * images.shape[2] // _PIXELS_PER_SEED)
+        seeds_per_frame = min(config.seeds // len(picked), images.shape[1] * images.shape[2] // _PIXELS_PER_SEED)
         seeds = [
             _lift_seeds(
                 scene,
                 known,
                 images[n],
                 indices[n],
-                each,
+                seeds_per_frame,
                 generator,
                 (ignored or {}).get(indices[n]),
                 None if depth is None else depth(scene.frames[indices[n]]),
@@ -115,10 +115,10 @@ def neighbour_distance(points: Tensor) -> Tensor:
     """
     if not bool(points.isfinite().all()):
         raise ValueError("points must be finite")
-    others = min(3, len(points) - 1)
-    if others < 1:
+    neighbours = min(3, len(points) - 1)
+    if neighbours < 1:
         return torch.zeros(len(points), device="cpu")
-    distances = nearest(points.numpy(), points.numpy(), others + 1, workers=-1)[0][:, 1:]
+    distances = nearest(points.numpy(), points.numpy(), neighbours + 1, workers=-1)[0][:, 1:]
     return from_numpy(np.sqrt((distances**2).mean(1))).float()
 
 
@@ -129,16 +129,16 @@ def _known(scene: Scene, indices: list[int], most: int, generator: torch.Generat
     outside of the sparse points' bounds.
     """
     points, colors, frames = surface_of(scene)
-    held = {scene.frames[i] for i in scene.solved} - {scene.frames[i] for i in indices}
+    held_out = {scene.frames[i] for i in scene.solved} - {scene.frames[i] for i in indices}
     if not len(points) or not len(scene.points):
         return scene.points, scene.colors
     low, high = (torch.quantile(scene.points[:, None], at, dim=0)[0] for at in (_OUTLIERS, 1.0 - _OUTLIERS))
     room = 0.5 * (high - low)
     kept = ((points > low - room) & (points < high + room)).all(1)
-    kept &= torch.tensor([frame not in held for frame in frames], device="cpu")
+    kept &= torch.tensor([frame not in held_out for frame in frames], device="cpu")
     places = kept.nonzero()[:, 0]
-    drawn = places[torch.randperm(len(places), generator=generator, device="cpu")[:most]]
-    return torch.cat([scene.points, points[drawn]]), torch.cat([scene.colors, colors[drawn]])
+    sample = places[torch.randperm(len(places), generator=generator, device="cpu")[:most]]
+    return torch.cat([scene.points, points[sample]]), torch.cat([scene.colors, colors[sample]])
 
 
 def _lift_seeds(

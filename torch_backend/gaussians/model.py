@@ -58,7 +58,7 @@ class Gaussians:
         self.params[name] = nn.Parameter(self.params["means"].new_full((len(self), *shape), value))
         return self.params[name]
 
-    def own(self, rows: Tensor) -> dict[str, Tensor]:
+    def host_params(self, rows: Tensor) -> dict[str, Tensor]:
         """Host parameters of the Gaussians `rows` [M], by name."""
         return {name: p[rows] for name, p in self.params.items() if name not in PARAM_NAMES}
 
@@ -68,7 +68,7 @@ class Gaussians:
 
         If memory runs out, nothing is changed.
         """
-        made = {name: nn.Parameter(old.detach()[parent].contiguous()) for name, old in self.params.items()}
+        rebuilt = {name: nn.Parameter(old.detach()[parent].contiguous()) for name, old in self.params.items()}
         is_open, support, hidden = self.open[parent], self.support[parent], self.hidden[parent]
         states: dict[str, dict[str, Tensor]] = {}
         for name, old in self.params.items():
@@ -81,8 +81,8 @@ class Gaussians:
         replaced: dict[int, nn.Parameter] = {}
         for name, old in self.params.items():
             if optimizer.state.pop(old, None) is not None:
-                optimizer.state[made[name]] = states[name]
-            replaced[id(old)] = self.params[name] = made[name]
+                optimizer.state[rebuilt[name]] = states[name]
+            replaced[id(old)] = self.params[name] = rebuilt[name]
         for group in optimizer.param_groups:
             group["params"] = [replaced.get(id(p), p) for p in group["params"]]
         self.open, self.support, self.hidden = is_open.contiguous(), support.contiguous(), hidden.contiguous()
@@ -108,8 +108,8 @@ class Gaussians:
         """Inverse of `state`; KeyError names a missing tensor."""
         flags = ("open", "support", "hidden")
         names = [name.removeprefix("gaussians.") for name in tensors if name.startswith("gaussians.")]
-        own = [name for name in names if name not in (*PARAM_NAMES, *flags)]
-        model = Gaussians({name: tensors[f"gaussians.{name}"] for name in (*PARAM_NAMES, *own)}, bins)
+        host_names = [name for name in names if name not in (*PARAM_NAMES, *flags)]
+        model = Gaussians({name: tensors[f"gaussians.{name}"] for name in (*PARAM_NAMES, *host_names)}, bins)
         model.open = tensors["gaussians.open"].clone()
         model.support = unpack_bits(tensors["gaussians.support"], bins)
         if "gaussians.hidden" in tensors:  # earlier versions did not store it

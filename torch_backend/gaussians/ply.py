@@ -130,18 +130,18 @@ def read_ply(path: str | Path) -> PlyGaussians:
     return gaussians
 
 
-def _check(gaussians: PlyGaussians, where: str = "") -> None:
+def _check(gaussians: PlyGaussians, prefix: str = "") -> None:
     count = gaussians.means.shape[0] if gaussians.means.ndim else 0
     bases = gaussians.sh.shape[1] if gaussians.sh.ndim == 3 else 0
     if bases not in SH_BASES:
-        raise ValueError(f"{where}sh should be [N,K,3] with K one of {SH_BASES}, got shape {gaussians.sh.shape}")
+        raise ValueError(f"{prefix}sh should be [N,K,3] with K one of {SH_BASES}, got shape {gaussians.sh.shape}")
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, bases, 3))
     for name, array, shape in zip(gaussians._fields, gaussians, shapes, strict=True):
         if array.shape != shape:
-            raise ValueError(f"{where}{name} should have shape {shape}, got {array.shape}")
+            raise ValueError(f"{prefix}{name} should have shape {shape}, got {array.shape}")
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array.reshape(count, -1))).any(axis=1).sum())
-            raise ValueError(f"{where}{name} of {bad} Gaussians is not finite")
+            raise ValueError(f"{prefix}{name} of {bad} Gaussians is not finite")
 
 
 def vertex_layout(handle: BinaryIO, path: Path) -> tuple[int, np.dtype]:

@@ -66,14 +66,14 @@ def _sh_degree(sh: Tensor | None, rest: Tensor | None, degree: int | None) -> in
         _shape("sh", sh, ("N", 1, 3))
         _shape("sh_rest", rest, (sh.shape[0], "K - 1", 3))
         bands += rest.shape[1]
-    held = _BANDS.get(bands)
-    if held is None:
+    highest = _BANDS.get(bands)
+    if highest is None:
         shapes = list(sh.shape) if rest is None else f"{list(sh.shape)} and {list(rest.shape)}"
         raise ValueError(f"sh must have shape [N, K, 3] with K = 1, 4, 9 or 16, not {shapes}")
     if degree is None:
-        return held
-    if not 0 <= degree <= held:
-        raise ValueError(f"sh_degree is {degree}, but sh holds degrees 0 to {held}")
+        return highest
+    if not 0 <= degree <= highest:
+        raise ValueError(f"sh_degree is {degree}, but sh holds degrees 0 to {highest}")
     return degree
 
 

@@ -113,7 +113,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.x_low, block.x_high, block.y_low, block.y_high = limits
     block.near = scene.settings.near
     slots = block.chunks * source.CHUNK
-    for name, each in (
+    for name, per_slot in (
         ("record", block.record_stride),
         ("aux", 4),
         ("index", 1),
@@ -126,7 +126,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
         ("span_start", 1),
         ("span_count", 1),
     ):
-        workspace.need(name, slots * each)
+        workspace.need(name, slots * per_slot)
     tiles = block.tiles_x * block.tiles_y
     workspace.need("span", 2 * source.SPANS * block.chunks)
     for name, count in (
@@ -193,7 +193,7 @@ class _Saved(NamedTuple):
     background: Tensor | None
     image: Tensor
     alpha: Tensor
-    behind: Tensor
+    channel_background: Tensor
     """[D]: background of every channel, 0 for depth."""
 
 
@@ -232,9 +232,9 @@ class _Rasterize(torch.autograd.Function):
         top_ids, top_weights = torch.empty(top_size, dtype=torch.int32), torch.empty(top_size)
         radii, means2d = torch.zeros(cameras, n, dtype=torch.int32), torch.zeros(cameras, n, 2)
         weights = torch.zeros(2, cameras, n if scene.with_contributions else 0)
-        behind = torch.zeros(channels)
+        channel_background = torch.zeros(channels)
         if background is not None:
-            behind[: scene.channels] = background
+            channel_background[: scene.channels] = background
         leases = [_Lease() for _ in range(cameras)]
         for c, lease in enumerate(leases):
             _set_up(lease.workspace, scene, c, channels)
@@ -246,7 +246,7 @@ class _Rasterize(torch.autograd.Function):
                 logits=logits,
                 colors=colors,
                 sh=sh,
-                background=behind,
+                background=channel_background,
                 image=image[c],
                 alpha=alpha[c],
                 median=median[c] if scene.with_depth else None,
@@ -261,7 +261,18 @@ class _Rasterize(torch.autograd.Function):
             _forward_camera(lease.workspace, scene, channels)
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(
-                means, quats, log_scales, logits, colors, sh, sh_rest, viewmats, background, image, alpha, behind
+                means,
+                quats,
+                log_scales,
+                logits,
+                colors,
+                sh,
+                sh_rest,
+                viewmats,
+                background,
+                image,
+                alpha,
+                channel_background,
             )
             ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
         ctx.mark_non_differentiable(median, radii, means2d, weights, top_ids, top_weights)
@@ -271,7 +282,20 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: _Context, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         saved, scene = _Saved(*ctx.saved_tensors), ctx.scene
-        means, quats, log_scales, logits, colors, sh, sh_rest, viewmats, background, image, alpha, behind = saved
+        (
+            means,
+            quats,
+            log_scales,
+            logits,
+            colors,
+            sh,
+            sh_rest,
+            viewmats,
+            background,
+            image,
+            alpha,
+            channel_background,
+        ) = saved
         grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
         grad_alpha = torch.zeros_like(alpha) if grads[1] is None else grads[1].contiguous()
         parameters = {
@@ -304,7 +328,7 @@ class _Rasterize(torch.autograd.Function):
                 logits=logits,
                 colors=colors,
                 sh=sh,
-                background=behind,
+                background=channel_background,
                 image=image[c],
                 alpha=alpha[c],
                 grad_image=grad_image[c],

@@ -159,12 +159,12 @@ def assemble(stages: list[str], extra: dict[str, object]) -> str:
         text += f"if (stage == {number}) {{\n{stage}\n}}\n"
     for name, value in values.items():
         if isinstance(value, tuple):
-            shown = ", ".join(f"{float(v)!r}f" for v in cast(tuple[float, ...], value))
+            literal = ", ".join(f"{float(v)!r}f" for v in cast(tuple[float, ...], value))
         elif isinstance(value, float):
-            shown = repr(value)
+            literal = repr(value)
         else:
-            shown = str(value)
-        text = text.replace(f"@{name}@", shown)
+            literal = str(value)
+        text = text.replace(f"@{name}@", literal)
     return text
 
 

@@ -174,22 +174,22 @@ class _Zeros(NamedTuple):
         """The zero tensors of a call on `scene`."""
         cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
         slots, tiles = cameras * n, cameras * -(-scene.width // TILE) * -(-scene.height // TILE)
-        wanted = scene.with_contributions
-        weighed = 3 * slots if wanted else 0
-        whole = torch.zeros(4 + weighed + 2 * slots + 2 * tiles, dtype=torch.int32, device=scene.means.device)
-        real = whole.view(torch.float32)
+        with_contributions = scene.with_contributions
+        weighed = 3 * slots if with_contributions else 0
+        buffer = torch.zeros(4 + weighed + 2 * slots + 2 * tiles, dtype=torch.int32, device=scene.means.device)
+        real = buffer.view(torch.float32)
 
         def part(of: Tensor, first: int) -> Tensor:
             return of.as_strided((cameras, n), (n, 1), first)
 
-        tile_start, tile_end = whole[whole.numel() - 2 * tiles :].view(2, tiles).unbind()
+        tile_start, tile_end = buffer[buffer.numel() - 2 * tiles :].view(2, tiles).unbind()
         return cls(
             tile_start=tile_start,
             tile_end=tile_end,
             norms=(part(real, 4 + weighed), part(real, 4 + weighed + slots)),
-            hits=whole[:4].view(torch.int64),
-            weight_sum=part(whole[: 4 + weighed - weighed % 2].view(torch.int64), 2) if wanted else None,
-            weight_max=part(real, 4 + 2 * slots) if wanted else None,
+            hits=buffer[:4].view(torch.int64),
+            weight_sum=part(buffer[: 4 + weighed - weighed % 2].view(torch.int64), 2) if with_contributions else None,
+            weight_max=part(real, 4 + 2 * slots) if with_contributions else None,
         )
 
 

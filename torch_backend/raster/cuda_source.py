@@ -168,7 +168,7 @@ def _harmonics(before: str, per_band: str, after: str) -> str:
 _LOAD = "load12(from + @q@, 3 * P.bands - @q@, f);"
 
 
-def _shown_harmonics() -> str:
+def _harmonics_text() -> str:
     """`@HARMONICS@` of `project.cu`: the colour c0, c1, c2 from the coefficients `from`."""
     return _harmonics(
         _LOAD + "\n",
@@ -199,7 +199,7 @@ def _assemble(stage: str, **extra: object) -> str:
     values = {name: getattr(k, name) for name in dir(k) if name.isupper() and not name.startswith("SH_")}
     values |= {"BLOCK": BLOCK, "HEAD": HEAD, "MOMENTS": MOMENTS, "WEIGHT_SCALE": WEIGHT_SCALE} | extra
     text = kernel_text(_KERNELS / "common.cu") + kernel_text(_KERNELS / stage)
-    text = text.replace("@HARMONICS@", _shown_harmonics()).replace("@HARMONICS_BACKWARD@", _backward_harmonics())
+    text = text.replace("@HARMONICS@", _harmonics_text()).replace("@HARMONICS_BACKWARD@", _backward_harmonics())
     for name, value in values.items():
         text = text.replace(f"@{name}@", repr(value) if isinstance(value, float) else str(value))
     return re.sub(r"\bP\.(\w+)", _field, text)

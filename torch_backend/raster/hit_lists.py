@@ -47,9 +47,9 @@ class Demand:
             demand = demand * slots // self.slots
         self.slots = max(self.slots, slots)
         if self.capacity == 0 or demand > _FULL * self.capacity:
-            wanted = max(demand * 4 // 3, self.capacity, 1)
+            capacity = max(demand * 4 // 3, self.capacity, 1)
             most = max(min(_hits_at_most(self.most.device), HITS_MAX), self.capacity, HITS_STEP)
-            self.capacity = min(-(-wanted // HITS_STEP) * HITS_STEP, most)
+            self.capacity = min(-(-capacity // HITS_STEP) * HITS_STEP, most)
 
     def report(self) -> None:
         """Copy the maximum to the host, behind the work queued so far. Until then the host reads the previous value."""
@@ -75,8 +75,8 @@ def forget_demands() -> None:
 def outgrown(device: torch.device, cameras: int, width: int, height: int) -> int:
     """Largest known number of hits of calls of this device and size if the list's capacity must grow for it; else 0."""
     demand = _demands.get((device, cameras, width, height))
-    wanted = 0 if demand is None else int(demand.host[0])
-    return wanted if demand is not None and wanted > _FULL * demand.capacity else 0
+    hits = 0 if demand is None else int(demand.host[0])
+    return hits if demand is not None and hits > _FULL * demand.capacity else 0
 
 
 def listed(device: torch.device, cameras: int, width: int, height: int) -> int:

@@ -183,8 +183,8 @@ def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
         keep = (level > 0) & (f.xx + f.yy < k.VARIANCE_MAX)
         keep &= ((f.mean2d + extent >= 0.5) & (f.mean2d - extent <= size - 0.5)).all(-1)
         half = 0.5 * (f.xx + f.yy)
-        wide = half + ((0.5 * (f.xx - f.yy)).square() + f.xy * f.xy).sqrt()
-        radius = (wide * level.clamp_min(0)).sqrt().ceil()
+        eigenvalue = half + ((0.5 * (f.xx - f.yy)).square() + f.xy * f.xy).sqrt()
+        radius = (eigenvalue * level.clamp_min(0)).sqrt().ceil()
         order = keep.nonzero()[:, 0]
         order = order[torch.sort(f.depth[order], stable=True).indices]
     # Project only the kept Gaussians again: culled ones that overflowed would turn their zero gradient into NaN.
@@ -261,8 +261,8 @@ class _Batch:
     """[B, TILE]: pixel centres of the rows."""
 
 
-def _blend(p: _Projected, batch: _Batch, left: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Blend the batch behind transmittance `left` [B, P].
+def _blend(p: _Projected, batch: _Batch, transmittance: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Blend the batch behind `transmittance` [B, P].
 
     Returns weights alpha T [B, P, M]; the transmittance after each hit [B, P, M] (no gradient; meaningless once it is
     at T_STOP); the weighted sums of colour and depth [B, P, D + 1]; the transmittance after all hits [B, P].
@@ -285,11 +285,11 @@ def _blend(p: _Projected, batch: _Batch, left: Tensor) -> tuple[Tensor, Tensor, 
     opacity = (p.opacity[members] * batch.valid)[:, None]
     alpha = opacity * torch.exp(exponent.flatten(1, 2))
     alpha = alpha.clamp_max(k.ALPHA_MAX).masked_fill(alpha < k.ALPHA_MIN, 0.0)
-    after = left[..., None] * torch.cumprod(1 - alpha, -1)
-    before = torch.cat((left[..., None], after[..., :-1]), -1)
+    after = transmittance[..., None] * torch.cumprod(1 - alpha, -1)
+    before = torch.cat((transmittance[..., None], after[..., :-1]), -1)
     weights = (alpha * before).masked_fill(before <= k.T_STOP, 0.0)
     sums = weights @ torch.cat((p.colors, p.depth[:, None]), -1)[members]
-    return weights, after.detach(), sums, left - weights.sum(-1)
+    return weights, after.detach(), sums, transmittance - weights.sum(-1)
 
 
 @dataclass
@@ -298,7 +298,7 @@ class _Pixels:
 
     sums: Tensor
     """[B, P, D + 1]: sum of alpha T times colour, and times depth."""
-    left: Tensor
+    transmittance: Tensor
     """[B, P]: remaining transmittance."""
     top: Tensor
     """[B, P] int64: position in _Projected of the Gaussian with the largest alpha T, -1 for none."""
@@ -335,22 +335,22 @@ class _Camera:
         xs, ys = (at[:, None] * k.TILE + centres for at in (tiles % self.across, tiles // self.across))
         inside = ((ys < self.scene.height)[:, :, None] & (xs < self.scene.width)[:, None, :]).flatten(1)
         # Pixels outside the image start as finished.
-        left = torch.where(inside, 1.0, k.T_STOP).to(dtype=self.dtype, device=self.device)
-        sums = left.new_zeros(*left.shape, self.p.colors.shape[1] + 1)
-        top, top_weight = torch.full_like(left, -1, dtype=torch.int64), torch.zeros_like(left)
-        return xs, ys, _Pixels(sums, left, top, top_weight, torch.full_like(left, k.DEPTH_EMPTY))
+        transmittance = torch.where(inside, 1.0, k.T_STOP).to(dtype=self.dtype, device=self.device)
+        sums = transmittance.new_zeros(*transmittance.shape, self.p.colors.shape[1] + 1)
+        top, top_weight = torch.full_like(transmittance, -1, dtype=torch.int64), torch.zeros_like(transmittance)
+        return xs, ys, _Pixels(sums, transmittance, top, top_weight, torch.full_like(transmittance, k.DEPTH_EMPTY))
 
     def _tiles(self, tiles: Tensor) -> _Pixels:
         """Blend `tiles` [B], in steps over their hits if a single tile exceeds `_LANES`."""
         xs, ys, out = self._empty(tiles)
         starts, counts = self.starts[tiles, None], self.counts[tiles, None]
-        crossed = torch.zeros_like(out.left, dtype=torch.bool)
+        crossed = torch.zeros_like(out.transmittance, dtype=torch.bool)
         most, step = int(counts.max()), _LANES // k.TILE**2
         for first in range(0, most, step):
             numbers = torch.arange(first, min(first + step, most), device=tiles.device)
             valid = numbers < counts
             batch = _Batch(self.members[torch.where(valid, starts + numbers, 0)], valid, xs, ys)
-            weights, after, sums, out.left = checkpoint(_blend, self.p, batch, out.left)
+            weights, after, sums, out.transmittance = checkpoint(_blend, self.p, batch, out.transmittance)
             out.sums = out.sums + sums
             with torch.no_grad():
                 if self.scene.with_contributions:
@@ -433,8 +433,8 @@ def rasterize(scene: Scene) -> RasterOutput:
         top = torch.cat((p.index, p.index.new_tensor([-1])))[out.top].to(torch.int32)
         images.append(
             (
-                out.sums[..., :-1] + out.left[..., None] * background,
-                1 - out.left,
+                out.sums[..., :-1] + out.transmittance[..., None] * background,
+                1 - out.transmittance,
                 out.sums[..., -1],
                 out.median,
                 top,

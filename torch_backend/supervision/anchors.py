@@ -78,15 +78,15 @@ class SupervisionConfig:
         if self.pulls not in ("all", "field"):
             raise ValueError(f"pulls is {self.pulls!r}: it should be all or field")
 
-    def hidden_due(self, iteration: int) -> bool:
+    def is_hidden_step(self, iteration: int) -> bool:
         """True if hidden Gaussians of the frame are marked at this step."""
         return self.preset == "support" and self.anchor == "hidden" and iteration % self.look_every == 0
 
-    def anchors_due(self, iteration: int, progress: float) -> bool:
+    def is_anchor_step(self, iteration: int, progress: float) -> bool:
         """True if `support` anchors at this step. `progress` is the share of the run that is done."""
         return self.preset == "support" and progress >= self.start and iteration % self.support_every == 0
 
-    def paper_due(self, iteration: int, progress: float) -> bool:
+    def is_paper_step(self, iteration: int, progress: float) -> bool:
         """True if `paper` acts at this step."""
         return self.preset == "paper" and progress >= self.start and iteration % self.every == 0
 
@@ -181,8 +181,8 @@ def support_loss(
     left, has_left, right, has_right = nearest_supported(model.support[rows], bins)
     with torch.no_grad():
         means = model.params["means"][rows]
-        own = model.own(torch.cat([rows, rows]))
-        anchors = field(torch.cat([means, means]), torch.cat([centres[left], centres[right]]), own)
+        host_params = model.host_params(torch.cat([rows, rows]))
+        anchors = field(torch.cat([means, means]), torch.cat([centres[left], centres[right]]), host_params)
         near_left = (centres[bins] - centres[left]) * seconds
         near_right = (centres[right] - centres[bins]) * seconds
         share = (near_left / (near_left + near_right).clamp_min(1e-6)).clamp(0.0, 1.0)
@@ -191,8 +191,8 @@ def support_loss(
             torch.where(has_left, near_left, torch.inf), torch.where(has_right, near_right, torch.inf)
         )
         confidence = torch.exp(-distance / config.support_seconds)
-    held, widths = _columns(anchors)
-    first, second = held.reshape(2, len(rows), -1)
+    columns, widths = _columns(anchors)
+    first, second = columns.reshape(2, len(rows), -1)
     gap = _columns(deltas)[0] - torch.lerp(first, second, share[:, None])
     weights = tuple((_ATTRIBUTE_WEIGHTS[name],) for name, width in widths for _ in range(width))
     weight = small_table(weights, torch.float32, gap.device)
@@ -302,14 +302,14 @@ def well_supervised(
     return ndc[0] + ndc[1] > config.defective_gradient
 
 
-def paper_loss(one: PaperView, two: PaperView, progress: float, config: SupervisionConfig) -> Tensor | None:
+def paper_loss(first: PaperView, second: PaperView, progress: float, config: SupervisionConfig) -> Tensor | None:
     """Sum of the paper's two terms for a pair of views, 0-dim; None if there is no valid anchor.
 
     Hidden Gaussians of the later view are anchored to the earlier view. Defective Gaussians of the earlier view are
     anchored to the later view. The reference is detached and must be well supervised: inside the frustum, and
     supervised by the image. Each term is averaged over the Gaussians and summed over the attributes.
     """
-    early, late = (one, two) if one.time < two.time else (two, one)
+    early, late = (first, second) if first.time < second.time else (second, first)
     if early.time == late.time:
         return None
     phi = math.exp(-config.tau * (late.time - early.time))

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..gaussians import Gaussians
 
 MAX_BINS = 256
-_BEHIND = 0.02
+_DEPTH_TOLERANCE = 0.02
 """Share of the depth by which a centre must lie behind the visible surface, beyond its own size, to count as hidden."""
 SEEN_WEIGHT = 0.1
 """Sum of alpha * T over a frame's pixels above which a Gaussian counts as seen in it."""
@@ -75,8 +75,8 @@ def mark_hidden(
     at = torch.nan_to_num(pixels).long()
     seen = depth.detach()[at[:, 1].clamp(0, height - 1), at[:, 0].clamp(0, width - 1)]
     size = state["log_scales"].detach()[rows].amax(1).exp()
-    behind = z > (1.0 + _BEHIND) * seen + size
-    model.hidden[rows, time_bin] = ~inside | behind
+    is_occluded = z > (1.0 + _DEPTH_TOLERANCE) * seen + size
+    model.hidden[rows, time_bin] = ~inside | is_occluded
 
 
 def nearest_supported(support: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

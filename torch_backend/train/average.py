@@ -34,7 +34,7 @@ class ParameterMean:
             self._mean[name].lerp_(value.detach(), 1.0 / self.count)
 
     @torch.no_grad()
-    def put_into(self, parameters: Mapping[str, Tensor]) -> None:
+    def copy_into(self, parameters: Mapping[str, Tensor]) -> None:
         """Sets the parameters to their mean and resets it. Values without a finite mean stay unchanged."""
         for name, mean in self._mean.items():
             value = parameters[name].detach()

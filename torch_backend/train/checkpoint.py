@@ -49,8 +49,8 @@ def misfit(path: Path, error: Exception, code: ExitCode) -> Exception:
     """JobError for an exception in `MISFITS`. Errors of the GPU, which the checkpoint did not cause, stay unchanged."""
     if isinstance(error, torch.OutOfMemoryError | torch.AcceleratorError):
         return error
-    what = str(error).strip().splitlines()
-    reason = f"{type(error).__name__}: {what[0]}" if what else type(error).__name__
+    lines = str(error).strip().splitlines()
+    reason = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
     return JobError(
         f"The checkpoint {path} does not fit this version ({reason}).", "Train the run again with --restart.", code
     )

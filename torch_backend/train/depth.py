@@ -34,7 +34,7 @@ DEPTH_VERSION = 1
 """Version of the fit, part of the key. Increase it when a change alters the fitted maps."""
 _MOST_POINTS = 4000
 """Maximum number of the solve's points in a frame's fit, of each kind (surface, sparse)."""
-_AHEAD = 1e-3
+_MIN_DEPTH = 1e-3
 """Least depth of a point in scene units. Also the least alpha by which a pixel's inverse depth is divided."""
 
 
@@ -110,7 +110,7 @@ class DepthTargets:
         return found if bool((found[0] > 0).any()) else None
 
 
-def depth_pull(state: Mapping[str, Tensor], moves: Tensor | None, viewmat: Tensor, K: Tensor, wanted: Tensor) -> Tensor:
+def depth_pull(state: Mapping[str, Tensor], moves: Tensor | None, viewmat: Tensor, K: Tensor, target: Tensor) -> Tensor:
     """Depth loss of one view, 0-dim; see `deviation`.
 
     Its gradient only moves means along the camera's axis. A loss on rendered depth would also change opacities and
@@ -121,9 +121,9 @@ def depth_pull(state: Mapping[str, Tensor], moves: Tensor | None, viewmat: Tenso
         state: parameters at the frame's time, as returned by `DynamicModel.moved`.
         moves: bool [N] Gaussians that receive the gradient; None: all.
         viewmat: [4, 4] world-to-camera matrix. `K`: [3, 3] intrinsics for an image of H x W pixels.
-        wanted: [2, H, W] target inverse depth (0: no target) and its standard deviation.
+        target: [2, H, W] target inverse depth (0: no target) and its standard deviation.
     """
-    height, width = wanted.shape[1:]
+    height, width = target.shape[1:]
     view = viewmat.detach()
     depth = state["means"] @ view[2, :3] + view[2, 3]
     if moves is not None:
@@ -131,15 +131,15 @@ def depth_pull(state: Mapping[str, Tensor], moves: Tensor | None, viewmat: Tenso
     means, quats, log_scales, opacities = (
         state[name].detach() for name in ("means", "quats", "log_scales", "opacity_logits")
     )
-    inverse = 1.0 / depth.clamp_min(_AHEAD)
+    inverse = 1.0 / depth.clamp_min(_MIN_DEPTH)
     moments = torch.stack([inverse, inverse.square()], dim=1)
     out = rasterize(
         means, quats, log_scales, opacities, moments, viewmats=view[None], Ks=K[None], width=width, height=height
     )
-    return deviation(out.colors[0] / out.alphas[0].clamp_min(_AHEAD)[..., None], wanted)
+    return deviation(out.colors[0] / out.alphas[0].clamp_min(_MIN_DEPTH)[..., None], target)
 
 
-def deviation(moments: Tensor, wanted: Tensor) -> Tensor:
+def deviation(moments: Tensor, target: Tensor) -> Tensor:
     """Pseudo-Huber loss of the inverse depth error in standard deviations, averaged over all pixels; 0-dim.
 
     The loss grows linearly beyond one standard deviation, so that outliers of the map have a bounded gradient.
@@ -147,10 +147,10 @@ def deviation(moments: Tensor, wanted: Tensor) -> Tensor:
     Args:
         moments: [H, W, 2] first and second moment of the inverse depth of each pixel's Gaussians. The second moment
             makes the loss penalise the error of each Gaussian, not only of their mean.
-        wanted: as in `depth_pull`.
+        target: as in `depth_pull`.
     """
-    squared = moments[..., 1] - 2.0 * wanted[0] * moments[..., 0] + wanted[0].square()
-    squared = torch.where(wanted[0] > 0, (squared / wanted[1].square()).clamp_min(0.0), 0.0)
+    squared = moments[..., 1] - 2.0 * target[0] * moments[..., 0] + target[0].square()
+    squared = torch.where(target[0] > 0, (squared / target[1].square()).clamp_min(0.0), 0.0)
     return (torch.sqrt(1.0 + squared) - 1.0).mean()
 
 
@@ -210,8 +210,8 @@ def load_fitted(folder: Path, key: str, config: DepthConfig | None = None) -> Fi
         tensors, meta = load_checkpoint(path)
         inverse, frames, sigma = tensors["inverse"], tensors["frames"], tensors["sigma"]
         facts = meta["facts"]
-        whole = inverse.dim() == 3 and inverse.dtype == torch.float16 and len(frames) == len(sigma) == len(inverse)
-        if not whole or not is_json_object(facts) or facts.get("key") != key:
+        is_valid = inverse.dim() == 3 and inverse.dtype == torch.float16 and len(frames) == len(sigma) == len(inverse)
+        if not is_valid or not is_json_object(facts) or facts.get("key") != key:
             raise ValueError("it is of another training")
         return FittedDepth(
             integers(frames), inverse, floats(sigma), facts,
@@ -238,7 +238,7 @@ def _undistorted_maps(
     lenses = load_plate_lenses(Shot(scene.folder.parent))
     maps: dict[int, NDArray[np.float32]] = {}
     lens: PlateLens | MapLens | None = None
-    where = np.zeros((0, 0, 2), np.float32)
+    source_pixels = np.zeros((0, 0, 2), np.float32)
     for done, index in enumerate(scene.solved, start=1):
         report.check_cancelled()
         frame = scene.frames[index]
@@ -248,10 +248,10 @@ def _undistorted_maps(
             continue
         if lenses[frame] is not lens:  # a clip has one lens, a zoom has one per frame
             lens = lenses[frame]
-            where = lens.where(width, height)
+            source_pixels = lens.where(width, height)
         h, w = values.shape
-        x = np.floor(where[..., 0] * (w / width)).astype(np.int64)
-        y = np.floor(where[..., 1] * (h / height)).astype(np.int64)
+        x = np.floor(source_pixels[..., 0] * (w / width)).astype(np.int64)
+        y = np.floor(source_pixels[..., 1] * (h / height)).astype(np.int64)
         inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
         maps[frame] = np.where(inside, values[y.clip(0, h - 1), x.clip(0, w - 1)], np.float32(np.nan))
     return maps
@@ -281,7 +281,7 @@ def _samples(
             points = seen if len(seen) >= LEAST_POINTS else sparse
         view, K = scene.viewmats[index].double().numpy(), Ks[index]
         local = points @ view[:3, :3].T + view[:3, 3]
-        local = local[local[:, 2] > _AHEAD]
+        local = local[local[:, 2] > _MIN_DEPTH]
         depth = local[:, 2]
         x = np.floor(local[:, 0] / depth * K[0, 0] + K[0, 2])
         y = np.floor(local[:, 1] / depth * K[1, 1] + K[1, 2])

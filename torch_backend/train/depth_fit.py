@@ -95,28 +95,28 @@ def _fit(samples: Samples, enough: list[int], kind: str) -> SequenceFit:
         values, depths = samples[frame]
         return values, depths if kind == KINDS[0] else 1.0 / depths
 
-    own = {frame: _line(*of(frame)) for frame in enough}
-    lines = np.array([line for line, _ in own.values()])
+    lines_by_frame = {frame: _line(*of(frame)) for frame in enough}
+    lines = np.array([line for line, _ in lines_by_frame.values()])
     common = np.median(lines, axis=0)
     between = np.diag(np.square(_TO_SIGMA * np.median(np.abs(lines - common), axis=0)))
     fits: dict[int, FrameFit] = {}
     errors, unexplained = list[float](), list[float]()
     for frame in enough:
-        line, covariance = own[frame]
+        line, covariance = lines_by_frame[frame]
         line = common + between @ np.linalg.pinv(between + covariance) @ (line - common)
         values, y = of(frame)
         fit = _frame_fit(line, 0.0, len(y))
-        off = fit.of(values) - y
-        sigma = max(LEAST_SIGMA * float(np.median(y)), _TO_SIGMA * float(np.median(np.abs(off))))
+        residuals = fit.of(values) - y
+        sigma = max(LEAST_SIGMA * float(np.median(y)), _TO_SIGMA * float(np.median(np.abs(residuals))))
         fits[frame] = _frame_fit(line, sigma, len(y))
-        errors.append(float(np.median(np.abs(off / y))))
+        errors.append(float(np.median(np.abs(residuals / y))))
         deviation = float(np.abs(values - np.median(values)).mean())
-        unexplained.append(float(np.abs(off * fit.slope).mean()) / max(deviation, 1e-12))
+        unexplained.append(float(np.abs(residuals * fit.slope).mean()) / max(deviation, 1e-12))
     sigma = float(np.median([fit.sigma for fit in fits.values()]))
-    wander = float(np.sqrt(between[1, 1])) / max(abs(float(common[0])), 1e-12)
+    scale_deviation = float(np.sqrt(between[1, 1])) / max(abs(float(common[0])), 1e-12)
     for frame in samples:
         if frame not in fits:
-            fits[frame] = _frame_fit(common, float(np.hypot(sigma, wander)), len(samples[frame][0]))
+            fits[frame] = _frame_fit(common, float(np.hypot(sigma, scale_deviation)), len(samples[frame][0]))
     residual, share = float(np.median(errors)), float(np.median(unexplained))
     return SequenceFit(kind, dict(sorted(fits.items())), residual, share)
 

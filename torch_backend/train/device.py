@@ -29,7 +29,7 @@ def choose_device(requested: str, report: Reporter | None = None, doing: str = "
     """
     device, unused = decide_device(requested)
     if report is not None and unused is not None:
-        report.warning(*unused_words(unused, doing))
+        report.warning(*unused_warning(unused, doing))
     if report is not None and device.type == "cuda" and planes_cuda.refused:
         report.warning(
             f"{doing} computes what moves with PyTorch's own operators, which takes longer: the graphics card failed "
@@ -67,7 +67,7 @@ def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]
     return torch.device("cpu"), unused
 
 
-def unused_words(unused: tuple[str, str], doing: str) -> tuple[str, str]:
+def unused_warning(unused: tuple[str, str], doing: str) -> tuple[str, str]:
     """(sentence, hint) of a warning that `doing` does not use the GPU, from the second item of `decide_device`."""
     return f"{doing} uses the processor, not the graphics card: {unused[0]}", unused[1]
 

@@ -6,9 +6,9 @@ from torch import Tensor
 
 from ..deformation import Deformation, Rehearsal, Start, field_box, host
 from .losses import photometric
-from .movers import close_strays, harden, on_trial
+from .movers import close_still, harden, on_trial
 from .optimizer import add_field, limit_harmonics
-from .repair import drop_thrown
+from .repair import drop_displaced
 from .trainer import Trainer
 
 
@@ -28,15 +28,15 @@ def _due_events(trainer: Trainer) -> None:
     trainer.model.sh_degree = trainer.policy.sh_degree(degree)
     if c.poses.on and not trainer.refined and trainer.progress >= c.poses.until:
         trainer.freeze_poses()
-    due = trainer.iteration > 0 and trainer.iteration % c.densify.every == 0
-    if due and c.densify.start <= trainer.progress < 0.9:
+    is_due = trainer.iteration > 0 and trainer.iteration % c.densify.every == 0
+    if is_due and c.densify.start <= trainer.progress < 0.9:
         if trainer.recorder is not None:
             trainer.recorder.forget()  # growth replaces the tensors that recordings use, and needs their memory
         trainer.densifier.step(
             trainer.model.gaussians, trainer.optimizer, trainer.initial, trainer.progress, trainer.policy.growing
         )
         if trainer.policy.facts.hardened is not None:  # not in methods without a gate, which stay as published
-            drop_thrown(trainer.model, trainer.optimizer, trainer.densifier, trainer.soundness.memory)
+            drop_displaced(trainer.model, trainer.optimizer, trainer.densifier, trainer.soundness.memory)
     if c.method == "static":
         return
     if c.method == "auto":
@@ -47,7 +47,7 @@ def _due_events(trainer: Trainer) -> None:
             harden_gate(trainer)
         elif trainer.iteration == round(c.densify.stop * c.iterations) and trainer.policy.facts.hardened is not None:
             trainer.inspect_nonfinite()
-            close_strays(trainer)
+            close_still(trainer)
     elif trainer.model.field is None and trainer.progress >= c.field.start:
         trainer.model.gaussians.open[:] = True
         _create_field(trainer)
@@ -80,7 +80,7 @@ def harden_gate(trainer: Trainer) -> None:
     if trainer.model.field is None or not len(trainer.model.open_rows()):
         return
     if harden(trainer):
-        close_strays(trainer)
+        close_still(trainer)
         trainer.policy.gate_hardened(trainer.iteration)
 
 

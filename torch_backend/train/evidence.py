@@ -132,29 +132,30 @@ def _inspect_frame(
         model.state_at(time), model.sh_degree, viewmat, K, width, trainer.height, colors=motion,
         background=torch.cat([trainer.background, motion.new_zeros(2)]), with_depth=False, with_contributions=False,
     )  # fmt: skip
-    shown = model.exposure.apply(out.colors[0, ..., :3], time)
+    rendered = model.exposure.apply(out.colors[0, ..., :3], time)
     plate, ignored = image.to(trainer.device, torch.float32), trainer.ignored_at(index)
     if ignored is not None:  # ignored pixels count as explained
-        plate = torch.where(ignored[..., None], shown, plate)
-    off = unexplained(plate, shown)
+        plate = torch.where(ignored[..., None], rendered, plate)
+    is_unexplained = unexplained(plate, rendered)
     far, share = out.colors[0, ..., 3:].cpu().unbind(-1)
     travels = torch.where(share > MOVING_SHARE, far / share.clamp_min(MOVING_SHARE), 0.0).clamp_min(0.0)
     moving = travels[travels > STILL_SHARE].flatten()[::16]
-    still = None if matte is None else _resized(matte == STILL, off.shape)
-    lost = None if still is None or not still.any() else float(off[still].float().mean())
+    still = None if matte is None else _resized(matte == STILL, is_unexplained.shape)
+    unexplained_share = None if still is None or not still.any() else float(is_unexplained[still].float().mean())
     return FrameEvidence(
-        trainer.scene.frames[index], held_out, psnr(shown, plate, ignored), shares(off.float()), _cells(travels, 0.97),
-        moving.numpy(), lost, None if matte is None else float((matte == MOVING).mean()),
+        trainer.scene.frames[index], held_out, psnr(rendered, plate, ignored), shares(is_unexplained.float()),
+        _cells(travels, 0.97), moving.numpy(), unexplained_share,
+        None if matte is None else float((matte == MOVING).mean()),
     )  # fmt: skip
 
 
-def unexplained(plate: Tensor, shown: Tensor) -> Tensor:
+def unexplained(plate: Tensor, rendered: Tensor) -> Tensor:
     """bool [H, W] on the CPU, True where low frequencies of two images [H, W, 3] differ by more than `UNEXPLAINED`."""
     radius = max(1, round(BLUR * plate.shape[1]))
-    off = (plate - shown).permute(2, 0, 1)[None]
+    difference = (plate - rendered).permute(2, 0, 1)[None]
     for _ in range(2):
-        off = F.avg_pool2d(off, 2 * radius + 1, 1, radius, count_include_pad=False)
-    return (off[0].abs().mean(0) > UNEXPLAINED).cpu()
+        difference = F.avg_pool2d(difference, 2 * radius + 1, 1, radius, count_include_pad=False)
+    return (difference[0].abs().mean(0) > UNEXPLAINED).cpu()
 
 
 def shares(values: Tensor) -> NDArray[np.float32]:

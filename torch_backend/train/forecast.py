@@ -86,27 +86,27 @@ class Alternative:
     """Width of its training images in pixels."""
 
 
-def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: float) -> list[Alternative]:
+def smaller_presets(preset: str, size: tuple[int, int], initial: int, seconds_per_pixel: float) -> list[Alternative]:
     """Presets below `preset`, the largest first.
 
     Args:
         preset: preset of the run.
         size: (width, height) of the working frames in pixels.
         initial: approximate initial number of Gaussians.
-        each: seconds per pixel.
+        seconds_per_pixel: seconds per pixel.
     """
     found: list[Alternative] = []
     for name in list(PRESETS)[: list(PRESETS).index(preset)]:
         config = PRESETS[name]()
         width = min(config.width or size[0], size[0])
         pixels = width * max(1, round(size[1] * width / size[0]))
-        grown = Densifier(config.densify, 0)
+        densifier = Densifier(config.densify, 0)
         first, steps = min(initial, config.densify.budget), config.iterations
 
-        def count(step: int, grown: Densifier = grown, first: int = first, steps: int = steps) -> float:
-            return grown.target(first, step / steps)
+        def count(step: int, densifier: Densifier = densifier, first: int = first, steps: int = steps) -> float:
+            return densifier.target(first, step / steps)
 
-        found.append(Alternative(name, each * Outlook(pixels, 0, steps, count).work(), width))
+        found.append(Alternative(name, seconds_per_pixel * Outlook(pixels, 0, steps, count).work(), width))
     return found[::-1]
 
 
@@ -127,11 +127,11 @@ def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternat
         sentence = f"The training takes about {long} more on the processor."
     less = "A smaller width or fewer Gaussians take less."
     if smaller:
-        other = next((row for row in smaller if row.seconds <= LONG_SECONDS), smaller[-1])
-        takes = duration(other.seconds)
-        less = f"The preset {other.preset} would take about {takes}."
+        alternative = next((row for row in smaller if row.seconds <= LONG_SECONDS), smaller[-1])
+        takes = duration(alternative.seconds)
+        less = f"The preset {alternative.preset} would take about {takes}."
         # At the same width, the preset only saves steps; on a clip 640 pixels wide, the extra steps gained nothing.
-        if other.width >= width:
-            less = f"The preset {other.preset} would take about {takes} on pictures of the same size."
+        if alternative.width >= width:
+            less = f"The preset {alternative.preset} would take about {takes} on pictures of the same size."
     kept = "It can be paused at any time and goes on where it stopped."
     return sentence, f"{kept} {less}"

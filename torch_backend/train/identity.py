@@ -20,7 +20,7 @@ from .config import TrainConfig, config_from_params, config_to_json
 from .depth import depth_key
 
 
-def asked_for(
+def requested_identity(
     shot: Shot, scene: Scene, run: Path, params: TrainParams, device: torch.device, report: Reporter, depth: list[str]
 ) -> tuple[TrainConfig, str, str | None]:
     """(configuration, key, motion) of the requested run. `motion` is the key of its mattes; None without mattes.
@@ -31,20 +31,20 @@ def asked_for(
     depth: `depth_identity` of the run's depth maps.
     """
     on_card = device.type == "cuda"
-    config, elsewhere = config_from_params(params, on_card), config_from_params(params, not on_card)
+    config, alternative = config_from_params(params, on_card), config_from_params(params, not on_card)
     key, motion = _identity(shot, scene, run, config, depth)
-    if elsewhere == config or not params.resume or begun(run, key) is not None:
+    if alternative == config or not params.resume or begun(run, key) is not None:
         return config, key, motion
-    its_key, its_motion = _identity(shot, scene, run, elsewhere, depth)
-    if begun(run, its_key) is None:
+    alternative_key, alternative_motion = _identity(shot, scene, run, alternative, depth)
+    if begun(run, alternative_key) is None:
         return config, key, motion
-    if finished(run, its_key) is None:
-        where = "the processor" if on_card else "a graphics card"
+    if finished(run, alternative_key) is None:
+        device_name = "the processor" if on_card else "a graphics card"
         report.warning(
-            f"The run was begun with the preset's numbers for {where}: it goes on with them.",
+            f"The run was begun with the preset's numbers for {device_name}: it goes on with them.",
             "Train it with --restart, or another run, for those of this device.",
         )
-    return elsewhere, its_key, its_motion
+    return alternative, alternative_key, alternative_motion
 
 
 def depth_identity(shot: Shot, sequence: DepthSequence | None) -> list[str]:
@@ -53,7 +53,7 @@ def depth_identity(shot: Shot, sequence: DepthSequence | None) -> list[str]:
 
 
 def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig, depth: list[str]) -> tuple[str, str | None]:
-    """(key, motion) of a run with this configuration, see `asked_for`."""
+    """(key, motion) of a run with this configuration, see `requested_identity`."""
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     motion = motion_of(shot, config)
     key = content_key(config_to_json(config), solve_key(shot), train, test, *masks_key(shot, IGNORE), *depth)
@@ -63,7 +63,7 @@ def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig, depth: l
         motion = None
     # With imported cameras, regraded footage has the same solve key, so the images are part of the key.
     anew, folder = content_key(key, pictures_key(shot)), begun(run, key)
-    if begun(run, anew) is not None or (folder and of_other_pictures(shot, read_meta(folder / CHECKPOINT_FILE))):
+    if begun(run, anew) is not None or (folder and has_changed_pictures(shot, read_meta(folder / CHECKPOINT_FILE))):
         key = anew
     return key, motion
 
@@ -89,7 +89,7 @@ def pictures_key(shot: Shot) -> str:
     return str(load_frames(shot).get("key", ""))
 
 
-def of_other_pictures(shot: Shot, facts: dict[str, Any]) -> bool:
+def has_changed_pictures(shot: Shot, facts: dict[str, Any]) -> bool:
     """True if a checkpoint with these facts was trained on other working frames than the shot has now."""
     return facts.get("pictures") != pictures_key(shot)
 

@@ -14,7 +14,7 @@ from ..shot import Shot
 from .checkpoint import CHECKPOINT_FILE, MISFITS, load_checkpoint, misfit
 from .config import TrainConfig, config_from_json
 from .depth import FittedDepth, load_fitted
-from .identity import of_other_pictures, solve_key
+from .identity import has_changed_pictures, solve_key
 from .model import DynamicModel, restore_model
 
 _ATTEMPTS = 5
@@ -73,7 +73,7 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
     if meta.get("solve") != solve_key(shot):
         message = f"The run {name!r} was trained on other cameras than the shot has now."
         raise JobError(message, "Train it again.", ExitCode.FREEZE)
-    if of_other_pictures(shot, meta):
+    if has_changed_pictures(shot, meta):
         message = f"The run {name!r} was trained on other pictures than the shot has now: they were imported again."
         raise JobError(message, "Train it again.", ExitCode.FREEZE)
     try:

@@ -39,7 +39,7 @@ class TrainingLoop:
     def __init__(self, trainer: Trainer, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
         """Arguments as in `train_to_end`."""
         self.trainer, self.checkpoint, self.evaluate = trainer, checkpoint, evaluate
-        self._foretold = False
+        self._has_forecast = False
         self._saved_at = time.perf_counter()
 
     def run(self) -> None:
@@ -65,7 +65,7 @@ class TrainingLoop:
                 self._with_room(lambda: trainer.average(length))
                 trainer.trained_seconds = time.perf_counter() - since
                 if watch is not None:
-                    self._foretell(watch, resumed=started > 0)
+                    self._report_forecast(watch, resumed=started > 0)
                 if (trainer.iteration - begin) % every == 0:
                     self._with_room(lambda: self.evaluate(trainer))
                     if watch is not None:
@@ -89,17 +89,17 @@ class TrainingLoop:
         """Runs repeatable `work` between steps. If GPU memory runs out, frees recordings or caches, and retries."""
         with contextlib.suppress(torch.OutOfMemoryError):
             return work()
-        if self.trainer.recorder is None or not self.trainer.recorder.give_up():
+        if self.trainer.recorder is None or not self.trainer.recorder.disable():
             torch.cuda.empty_cache()
         return work()
 
-    def _foretell(self, watch: Stopwatch, resumed: bool) -> None:
+    def _report_forecast(self, watch: Stopwatch, resumed: bool) -> None:
         """Reports the estimated time left after a step on the CPU, once enough steps have been timed. With the first
         estimate, warns if the run will take long."""
         trainer = self.trainer
         pixels, now = trainer.width * trainer.height, len(trainer.model.gaussians)
-        each = watch.step(step_work(pixels, now))
-        if each is None:
+        seconds_per_pixel = watch.step(step_work(pixels, now))
+        if seconds_per_pixel is None:
             return
         grows = trainer.policy.growing and not trainer.extensions
 
@@ -107,13 +107,15 @@ class TrainingLoop:
             share = step / trainer.config.iterations
             return max(now, trainer.densifier.target(trainer.initial, share)) if grows else now
 
-        left = each * Outlook(pixels, trainer.iteration, trainer.end, count).work()
-        trainer.report.metric(FORECAST, {"of": "training", "seconds_left": round(left, 1)})
-        if not self._foretold:
-            self._foretold = True
+        seconds_left = seconds_per_pixel * Outlook(pixels, trainer.iteration, trainer.end, count).work()
+        trainer.report.metric(FORECAST, {"of": "training", "seconds_left": round(seconds_left, 1)})
+        if not self._has_forecast:
+            self._has_forecast = True
             size = trainer.scene.width, trainer.scene.height
-            smaller = smaller_presets(trainer.config.preset, size, trainer.initial, each)
-            warning = warning_of(left, trainer.width, resumed, [row for row in smaller if row.seconds < left])
+            smaller = smaller_presets(trainer.config.preset, size, trainer.initial, seconds_per_pixel)
+            warning = warning_of(
+                seconds_left, trainer.width, resumed, [row for row in smaller if row.seconds < seconds_left]
+            )
             if warning is not None:
                 trainer.report.warning(*warning)
 
@@ -139,9 +141,9 @@ class TrainingLoop:
         if len(trainer.densifier.seen) != before:  # memory ran out within a round of growth
             trainer.densifier.reset(before)
         forget_demands()
-        held = trainer.recorder is not None and trainer.recorder.give_up()
+        has_freed = trainer.recorder is not None and trainer.recorder.disable()
         torch.cuda.empty_cache()
-        if held:
+        if has_freed:
             return
         self._save()
         moving = len(trainer.model.open_rows())

@@ -27,8 +27,8 @@ def photometric(image: Tensor, target: Tensor, dssim: float, ignored: Tensor | N
     if structured and image.is_cuda and ssim_cuda.supports(image, target):
         return ssim_cuda.photometric(image, target, dssim, ignored)
     if ignored is not None:
-        shown = image.detach()
-        image, target = (torch.where(ignored[..., None], shown, one) for one in (image, target))
+        detached = image.detach()
+        image, target = (torch.where(ignored[..., None], detached, values) for values in (image, target))
     loss = (image - target).abs().mean()
     if structured:
         loss = (1.0 - dssim) * loss + dssim * (1.0 - ssim(image, target))

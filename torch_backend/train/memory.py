@@ -65,14 +65,14 @@ def gaussian_bytes(config: TrainConfig, bins: int) -> int:
     return 4 * (5 * numbers + 2 * harmonics) + _RASTER_BYTES + hits + 2 * min(bins, MAX_BINS) + 40
 
 
-def moving_bytes(config: TrainConfig, whole: bool) -> int:
+def moving_bytes(config: TrainConfig, is_single_call: bool) -> int:
     """Bytes per moving Gaussian: deformed parameters with gradients and, if all Gaussians are evaluated at once
-    (`whole`), the field's intermediate tensors."""
-    return 4 * 4 * _MOVED + (config.field.row_bytes() if whole else 0)
+    (`is_single_call`), the field's intermediate tensors."""
+    return 4 * 4 * _MOVED + (config.field.row_bytes() if is_single_call else 0)
 
 
 def peak_bytes(
-    config: TrainConfig, pixels: int, bins: int, gaussians: int, *, whole: bool = True, frames: int = 0
+    config: TrainConfig, pixels: int, bins: int, gaussians: int, *, is_single_call: bool = True, frames: int = 0
 ) -> int:
     """Peak bytes of the tensors in a step.
 
@@ -80,13 +80,13 @@ def peak_bytes(
         pixels: number of pixels of a training image.
         bins: time bins of the support bitmap: number of training frames, at most 256.
         gaussians: number of Gaussians; all may be on trial at the same time.
-        whole: whether the field is evaluated for all Gaussians at once.
+        is_single_call: whether the field is evaluated for all Gaussians at once.
         frames: bytes of the training images if they are stored on the GPU, otherwise 0.
     """
     total = frames + pixels * _PIXEL_BYTES + gaussians * gaussian_bytes(config, bins)
     if config.method != "static":
-        total += gaussians * moving_bytes(config, whole)
-        total += 0 if whole else min(gaussians, PIECE) * 2 * config.field.row_bytes()
+        total += gaussians * moving_bytes(config, is_single_call)
+        total += 0 if is_single_call else min(gaussians, PIECE) * 2 * config.field.row_bytes()
     return total
 
 
@@ -105,17 +105,19 @@ def plan_memory(
     budget, pixels = gaussians or config.densify.budget, size[0] * size[1]
     room = (free - _FIXED) / _WASTE
     moves = config.method != "static" and budget > PIECE
-    for on_card, whole in ((True, True), (False, True), (False, False)):
-        fits = peak_bytes(config, pixels, bins, budget, whole=whole, frames=frames * on_card) <= room
-        if fits and (not on_card or frames <= free // 2) and (whole or moves):
-            pieces = None if whole else PIECE
+    for on_card, is_single_call in ((True, True), (False, True), (False, False)):
+        fits = peak_bytes(config, pixels, bins, budget, is_single_call=is_single_call, frames=frames * on_card) <= room
+        if fits and (not on_card or frames <= free // 2) and (is_single_call or moves):
+            pieces = None if is_single_call else PIECE
             text = (
-                "" if whole else f"{_asked(budget, size, free)}: what moves is computed in pieces, which takes longer."
+                ""
+                if is_single_call
+                else f"{_shortage(budget, size, free)}: what moves is computed in pieces, which takes longer."
             )
             return MemoryPlan(budget, pieces, on_card, text)
     base = peak_bytes(config, pixels, bins, 0)
-    each, rest = _each(config, bins, room - base)
-    fewer = min(int(rest / each), budget) // 1000 * 1000
+    per_gaussian, available = _bytes_per_gaussian(config, bins, room - base)
+    fewer = min(int(available / per_gaussian), budget) // 1000 * 1000
     if gaussians or fewer < LEAST:
         raise JobError(
             f"The graphics card has {free / 1e9:.1f} GB free, too little to train {budget:,} Gaussians on images of "
@@ -126,23 +128,23 @@ def plan_memory(
         )
     return MemoryPlan(
         fewer, PIECE if moves else None, False,
-        f"{_asked(budget, size, free)}: there will be {fewer:,} at most, which shows less detail. To have them all, "
+        f"{_shortage(budget, size, free)}: there will be {fewer:,} at most, which shows less detail. To have them all, "
         "close other programs that use the card, choose a smaller width, or train on the processor.",
     )  # fmt: skip
 
 
-def _each(config: TrainConfig, bins: int, room: float) -> tuple[float, float]:
+def _bytes_per_gaussian(config: TrainConfig, bins: int, room: float) -> tuple[float, float]:
     """(bytes per Gaussian, bytes available for Gaussians); with the field in pieces if more than `PIECE` fit."""
     fixed, moves = gaussian_bytes(config, bins), config.method != "static"
     if not moves:
         return fixed, room
-    whole = fixed + moving_bytes(config, True)
-    if room / whole <= PIECE:
-        return whole, room
+    per_gaussian = fixed + moving_bytes(config, True)
+    if room / per_gaussian <= PIECE:
+        return per_gaussian, room
     return fixed + moving_bytes(config, False), room - PIECE * 2 * config.field.row_bytes()
 
 
-def _asked(budget: int, size: tuple[int, int], free: int) -> str:
+def _shortage(budget: int, size: tuple[int, int], free: int) -> str:
     return (
         f"The graphics card has {free / 1e9:.1f} GB free, which is little for {budget:,} Gaussians on images of "
         f"{size[0]} x {size[1]} px"

@@ -55,22 +55,22 @@ class DynamicModel:
         """Deltas of the Gaussians `rows` [M] at times [M] or [1]. None without a field or rows."""
         if self.field is None or not len(rows):
             return None
-        return self.ask(self.field, self.gaussians.params["means"][rows], times, self.gaussians.own(rows))
+        return self.evaluate(self.field, self.gaussians.params["means"][rows], times, self.gaussians.host_params(rows))
 
-    def ask(self, field: Deformation, means: Tensor, times: Tensor, own: Mapping[str, Tensor]) -> Deltas:
+    def evaluate(self, field: Deformation, means: Tensor, times: Tensor, host_params: Mapping[str, Tensor]) -> Deltas:
         """Evaluates `field` at means [M, 3] and times [M] or [1].
 
         With `pieces` set, the Gaussians are split into chunks that are recomputed in the backward pass (gradient
         checkpointing).
         """
         if self.pieces is None or len(means) <= self.pieces:
-            return field(means, times, own)
+            return field(means, times, host_params)
         parts: list[Deltas] = []
         for first in range(0, len(means), self.pieces):
             rows = slice(first, first + self.pieces)
-            when = times if len(times) == 1 else times[rows]
-            held = {name: value[rows] for name, value in own.items()}
-            parts.append(checkpoint(field, means[rows], when, held))
+            chunk_times = times if len(times) == 1 else times[rows]
+            chunk_params = {name: value[rows] for name, value in host_params.items()}
+            parts.append(checkpoint(field, means[rows], chunk_times, chunk_params))
         joined = [None if part[0] is None else torch.cat(part) for part in zip(*parts, strict=True)]
         return Deltas(*joined)  # type: ignore[arg-type]
 
@@ -80,10 +80,10 @@ class DynamicModel:
 
     def state_at(self, time: float, canonical: bool = True) -> dict[str, Tensor]:
         """All parameters at a normalised time. Gradients reach the field, and with `canonical` also the Gaussians."""
-        rows, when = self.open_rows(), torch.tensor([time], device=self.device)
+        rows, times = self.open_rows(), torch.tensor([time], device=self.device)
         if canonical or self.field is None or not len(rows):
-            return self.moved(rows, self.deltas(rows, when))
-        deltas = self.field(self.gaussians.params["means"].detach()[rows], when, self.gaussians.own(rows))
+            return self.moved(rows, self.deltas(rows, times))
+        deltas = self.field(self.gaussians.params["means"].detach()[rows], times, self.gaussians.host_params(rows))
         return apply_deltas(self.gaussians, rows, deltas, self.field.rules, canonical=False)
 
 
@@ -140,8 +140,8 @@ def gathered(
     A pixel's gradient with respect to a Gaussian's colour is that blending weight, so one backward pass computes the
     sums.
     """
-    held = {name: value.detach() for name, value in state.items()}
+    detached = {name: value.detach() for name, value in state.items()}
     with torch.enable_grad():
-        ink = torch.zeros(len(held["means"]), weights.shape[2], device=weights.device, requires_grad=True)
-        out = render(held, 0, viewmat, K, width, height, colors=ink, with_contributions=False)
+        ink = torch.zeros(len(detached["means"]), weights.shape[2], device=weights.device, requires_grad=True)
+        out = render(detached, 0, viewmat, K, width, height, colors=ink, with_contributions=False)
         return weighted_gradient(out.colors[0, ..., 3:], ink, weights.to(ink))

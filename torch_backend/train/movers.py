@@ -103,12 +103,12 @@ def harden(run: RunView) -> bool:
 
 
 @torch.no_grad()
-def close_strays(run: RunView) -> None:
+def close_still(run: RunView) -> None:
     """In a long run, closes Gaussians that hardly contribute to moving pixels any more; they keep their mean change.
 
     Splits of open Gaussians are open as well, and many of them end up on still surfaces next to a mover.
     """
-    model, (share, frames) = run.model, GateConfig.STRAY
+    model, (share, frames) = run.model, GateConfig.STAY_OPEN
     rows = model.open_rows()
     if run.movers is None or not len(rows) or run.config.iterations <= GateConfig.LONG:
         return
@@ -116,9 +116,9 @@ def close_strays(run: RunView) -> None:
     _close(model, rows, moving_frames(run, share)[rows] < frames, mean)
 
 
-def _close(model: DynamicModel, rows: Tensor, strays: Tensor, mean: Deltas) -> None:
-    """Closes the Gaussians of `rows` [M] that are `strays`, bool [M], after applying their `mean` change."""
-    closed, moved = rows[strays], model.moved(rows, mean)
+def _close(model: DynamicModel, rows: Tensor, is_still: Tensor, mean: Deltas) -> None:
+    """Closes the Gaussians of `rows` [M] where `is_still`, bool [M], is set, after applying their `mean` change."""
+    closed, moved = rows[is_still], model.moved(rows, mean)
     for name, param in model.gaussians.params.items():
         if name in moved:
             param.data[closed] = moved[name][closed]

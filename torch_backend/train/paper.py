@@ -40,30 +40,30 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
 
     Returns the position of the other frame; None if it has the same time or is excluded.
     """
-    other = int(torch.randint(len(run.train_ids), (1,), generator=run.generator, device="cpu"))
-    if run.times[other] == run.times[frame] or other in run.excluded_frames:
+    second = int(torch.randint(len(run.train_ids), (1,), generator=run.generator, device="cpu"))
+    if run.times[second] == run.times[frame] or second in run.excluded_frames:
         return None
     supervision, model = run.config.supervision, run.model
     supervised = _supervised(run, frame, rows, state, out)
-    other_state = model.state_at(run.times[other])
-    other_state["means"].retain_grad()
-    other_out = run.render_trained(other_state, other)
-    exposed = model.exposure.apply(other_out.colors[0], run.times[other])
-    ignored = run.ignored_at(run.train_ids[other])
-    loss = photometric(exposed, run.image_of(other), run.config.dssim, ignored)
+    second_state = model.state_at(run.times[second])
+    second_state["means"].retain_grad()
+    second_out = run.render_trained(second_state, second)
+    exposed = model.exposure.apply(second_out.colors[0], run.times[second])
+    ignored = run.ignored_at(run.train_ids[second])
+    loss = photometric(exposed, run.image_of(second), run.config.dssim, ignored)
     backward(loss, retain_graph=True)
-    other_supervised = _supervised(run, other, rows, other_state, other_out)
+    second_supervised = _supervised(run, second, rows, second_state, second_out)
     every = supervision.pulls == "all"
     if not every:
-        other_state = model.state_at(run.times[other], canonical=False)
+        second_state = model.state_at(run.times[second], canonical=False)
     views = [
         _view(run, model.state_at(run.times[frame], canonical=every), frame, rows, supervised),
-        _view(run, other_state, other, rows, other_supervised),
+        _view(run, second_state, second, rows, second_supervised),
     ]
     loss = paper_loss(views[0], views[1], run.progress, supervision)
     if loss is not None and bool(torch.isfinite(loss)):
         backward(loss)
-    return other
+    return second
 
 
 def _supervised(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> Tensor:

@@ -29,17 +29,17 @@ class Pictures:
     plates: Plates | None
     """Source of the images; None: the working frames."""
 
-    def load(self, indices: list[int], report: Reporter | None = None, beside: Path | None = None) -> Tensor:
+    def load(self, indices: list[int], report: Reporter | None = None, folder: Path | None = None) -> Tensor:
         """Loads frames `indices` of the scene as `scene.load_images` does. JobError also if a plate cannot be read."""
         plates, frames = self.plates, self.scene.frames
         if plates is None:
-            return load_images(self.scene, indices, *self.size, report, beside)
+            return load_images(self.scene, indices, *self.size, report, folder)
 
         def read(index: int) -> Tensor:
             return plates.display(frames[index]).clamp(0.0, 1.0)
 
         try:
-            return load_images(self.scene, indices, *self.size, report, beside, read)
+            return load_images(self.scene, indices, *self.size, report, folder, read)
         finally:
             plates.close()
 

@@ -45,24 +45,24 @@ class Poses:
         """[I, 6]: rotation vector in radians about the scene's origin, and translation in scene units."""
         self._gauge = _Gauge(self._times, set(), device)
 
-    def at(self, times: np.ndarray, held: set[int] | None = None) -> Tensor:
-        """Corrections [T, 6] at normalised times [T], interpolated between training frames that are not in `held`."""
-        keep = [n for n in range(len(self._times)) if n not in (held or ())]
+    def at(self, times: np.ndarray, excluded: set[int] | None = None) -> Tensor:
+        """Corrections [T, 6] at normalised times [T], interpolated between training frames not in `excluded`."""
+        keep = [n for n in range(len(self._times)) if n not in (excluded or ())]
         known = self.values.detach().cpu().numpy()[keep]
         columns = [np.interp(times, self._times[keep], known[:, n]) for n in range(6)]
         return from_numpy(np.stack(columns, axis=1)).to(self.values)
 
     @torch.no_grad()
-    def fix_gauge(self, held: set[int]) -> None:
-        """Subtracts the mean correction after a step, and interpolates the corrections of frames in `held`."""
-        if self._gauge.held != held:
-            self._gauge = _Gauge(self._times, set(held), self.values.device)
+    def fix_gauge(self, excluded: set[int]) -> None:
+        """Subtracts the mean correction after a step, and interpolates the corrections of frames in `excluded`."""
+        if self._gauge.excluded != excluded:
+            self._gauge = _Gauge(self._times, set(excluded), self.values.device)
         gauge = self._gauge
         self.values -= self.values[gauge.keep].mean(0)
-        if not held:
+        if not excluded:
             return
         if self.values.device.type == "cpu":
-            self.values[gauge.rows] = self.at(self._times[gauge.rows.numpy()], held)
+            self.values[gauge.rows] = self.at(self._times[gauge.rows.numpy()], excluded)
         else:
             self.values[gauge.rows] = torch.lerp(self.values[gauge.left], self.values[gauge.right], gauge.share)
 
@@ -75,14 +75,14 @@ class _Gauge:
     """Indices and interpolation weights on the device. They are rebuilt only when the held-back frames change, so that
     no step waits for a transfer."""
 
-    def __init__(self, times: np.ndarray, held: set[int], device: torch.device) -> None:
-        keep = np.asarray([n for n in range(len(times)) if n not in held])
-        rows = np.asarray(sorted(held), dtype=np.int64)
+    def __init__(self, times: np.ndarray, excluded: set[int], device: torch.device) -> None:
+        keep = np.asarray([n for n in range(len(times)) if n not in excluded])
+        rows = np.asarray(sorted(excluded), dtype=np.int64)
         right = np.searchsorted(times[keep], times[rows]).clip(0, len(keep) - 1)
         left = np.where(times[rows] < times[keep[right]], (right - 1).clip(0), right)
         span = np.maximum(times[keep[right]] - times[keep[left]], 1e-12)
         share = ((times[rows] - times[keep[left]]) / span).clip(0.0, 1.0)
-        self.held = held
+        self.excluded = excluded
         self.keep, self.rows, self.left, self.right = (
             from_numpy(index.astype(np.int64)).to(device) for index in (keep, rows, keep[left], keep[right])
         )

@@ -110,7 +110,7 @@ class Recorder:
         self._recorded: dict[StepKind, _Recorded] = {}
         self._seen: set[tuple[StepKind, int]] = set()
         self._layout: tuple[object, ...] = ()
-        self._wanted = 0
+        self._demand = 0
         self._gradients = False
         self._short = 0
 
@@ -122,26 +122,26 @@ class Recorder:
             self._recorded.clear()
             self.recording.drop()
 
-    def give_up(self) -> bool:
+    def disable(self) -> bool:
         """Switches recording off after GPU memory ran out. Returns True if this freed the memory of a recording."""
-        held, self.refused = bool(self._recorded), "the memory of the graphics card ended"
+        has_recordings, self.refused = bool(self._recorded), "the memory of the graphics card ended"
         self.forget()
-        return held
+        return has_recordings
 
     def step(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
         """Runs one step and returns its photometric loss (0-dim), which the next step may overwrite."""
         run, seen = self.run, (kind, self.run.soundness.mended)
         if self.refused:
             return self._launched(kind, facts, frame)
-        layout, wanted = run.layout(), outgrown(self.device, 1, run.width, run.height)
-        outgrew = wanted > self._wanted  # the rasteriser enlarges its hit list only in a launched step
+        layout, demand = run.layout(), outgrown(self.device, 1, run.width, run.height)
+        outgrew = demand > self._demand  # the rasteriser enlarges its hit list only in a launched step
         if outgrew or not _same(layout, self._layout):
             self.forget()
             self._layout = layout
         if not kind.recordable or run.soundness.troubled:
             return self._launched(kind, facts, frame)
         if outgrew or seen not in self._seen:
-            self._wanted = max(wanted, self._wanted)
+            self._demand = max(demand, self._demand)
             self._seen.add(seen)
             with self.recording.watched():
                 return self._launched(kind, facts, frame)
@@ -188,8 +188,8 @@ class Recorder:
             self.refused = (str(error).strip().splitlines() or [type(error).__name__])[0]
         else:
             self.run.optimizer.zero_grad(set_to_none=True)  # memory of the recording, which other recordings overwrite
-            made = self._recorded[kind] = _Recorded(room, table, replay, loss, self._listed())
-            return made
+            recorded = self._recorded[kind] = _Recorded(room, table, replay, loss, self._listed())
+            return recorded
         # Outside of the handler, the traceback no longer keeps the unfinished graph and the step's tensors alive.
         self.run.optimizer.zero_grad(set_to_none=True)
         self._recorded.clear()
@@ -198,10 +198,10 @@ class Recorder:
         return None
 
 
-def _same(one: tuple[object, ...], two: tuple[object, ...]) -> bool:
+def _same(first: tuple[object, ...], second: tuple[object, ...]) -> bool:
     """True if all items are the same objects or equal integers."""
-    pairs = zip(one, two, strict=False)
-    return len(one) == len(two) and all(a is b or (isinstance(a, int) and a == b) for a, b in pairs)
+    pairs = zip(first, second, strict=False)
+    return len(first) == len(second) and all(a is b or (isinstance(a, int) and a == b) for a, b in pairs)
 
 
 class CudaGraphs:

@@ -42,7 +42,7 @@ from .movers import MOMENTS
 _FEW = 0.01
 """Largest share of Gaussians with a gradient that is not finite for which the Gaussians are dropped. A larger share
 indicates a fault of the frame or the field."""
-_THROWN = 0.1
+_MAX_TOO_FAR = 0.1
 """Largest share of the moving Gaussians that a stable field may displace too far at any time."""
 _FAR, _LEAST_FAR = 6.0, 1.0
 """A Gaussian is displaced too far if it moves by more than 6 times the moving Gaussians' median distance from their
@@ -101,29 +101,29 @@ class FieldMemory:
 
     def state(self) -> dict[str, Tensor]:
         """Tensors for a checkpoint, with which a resumed run makes the same repairs as an uninterrupted one."""
-        kept = {f"{_STATE}kept.{n}.{name}": p for n, one in enumerate(self._kept) for name, p in one.items()}
+        kept = {f"{_STATE}kept.{n}.{name}": p for n, copy in enumerate(self._kept) for name, p in copy.items()}
         return {f"{_STATE}reach": self._reach, f"{_STATE}worst": self._worst, **kept}
 
     @torch.no_grad()
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Inverse of `state`."""
-        own = {name.removeprefix(_STATE): t for name, t in tensors.items() if name.startswith(_STATE)}
-        self._reach.copy_(own["reach"])
-        self._worst.copy_(own["worst"])
+        stored = {name.removeprefix(_STATE): t for name, t in tensors.items() if name.startswith(_STATE)}
+        self._reach.copy_(stored["reach"])
+        self._worst.copy_(stored["worst"])
         device, kept = self._reach.device, [f"kept.{n}." for n in range(2)]
         found = [
-            {name.removeprefix(start): t.to(device, copy=True) for name, t in own.items() if name.startswith(start)}
+            {name.removeprefix(start): t.to(device, copy=True) for name, t in stored.items() if name.startswith(start)}
             for start in kept
         ]
         self._kept = found if any(found) else []
 
     @torch.no_grad()
-    def heed(self, shift: Tensor) -> None:
+    def observe(self, shift: Tensor) -> None:
         """Checks a step's displacement `shift` [M, 3] of the moving means, in scene units. NaNs do not count."""
         if len(shift):
-            self._worst.copy_(torch.maximum(self._worst, self.thrown(shift).float().mean()))
+            self._worst.copy_(torch.maximum(self._worst, self.is_too_far(shift).float().mean()))
 
-    def thrown(self, shift: Tensor) -> Tensor:
+    def is_too_far(self, shift: Tensor) -> Tensor:
         """bool [M] Gaussians whose displacement `shift` [M, 3], in scene units, is too far."""
         return shift.abs().amax(1) > self._reach
 
@@ -133,7 +133,7 @@ class FieldMemory:
         return kept if kept is not None and kept.shape == p.shape else None
 
     @torch.no_grad()
-    def put_back(self, field: Deformation, optimizer: torch.optim.Optimizer) -> str:
+    def restore_stable(self, field: Deformation, optimizer: torch.optim.Optimizer) -> str:
         """Restores the field if it displaced too many Gaussians too far at any step since the last inspection.
 
         The older of the two copies is restored, because the newer one may already be unstable. Halves the learning
@@ -143,7 +143,7 @@ class FieldMemory:
             return ""
         worst = float(self._worst)
         self._worst.zero_()
-        if not worst > _THROWN:
+        if not worst > _MAX_TOO_FAR:
             return ""
         named, before = dict(field.named_parameters()), self._kept[0]
         if {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in before.items()}:
@@ -209,7 +209,7 @@ def drop_offenders(model: DynamicModel, optimizer: torch.optim.Optimizer, densif
 
 
 @torch.no_grad()
-def drop_thrown(
+def drop_displaced(
     model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, memory: FieldMemory
 ) -> int:
     """Drops the Gaussians that the field displaces too far at any of `MOMENTS` times. Returns their number."""
@@ -218,7 +218,7 @@ def drop_thrown(
     for n in evenly_spaced(len(model.centres), MOMENTS):
         deltas = model.deltas(rows, model.centres[n : n + 1]) if len(rows) else None
         if deltas is not None:
-            dropped[rows] |= memory.thrown(deltas.means)
+            dropped[rows] |= memory.is_too_far(deltas.means)
     count = int(dropped.sum())
     if count:
         _drop(model, optimizer, densifier, dropped)
@@ -255,8 +255,8 @@ def _repair_gaussians(
         messages.append(f"mended {_counted(int(flat.sum()), 'Gaussian')} (quats without length)")
         identity = params["quats"].new_tensor([1.0, 0.0, 0.0, 0.0])
         _mend(params["quats"], flat[:, None].expand(-1, 4), identity.expand(len(flat), 4), optimizer)
-    own: Mapping[str, Owned] = {} if model.field is None else model.field.owned
-    for name, owned in own.items():
+    host_params: Mapping[str, Owned] = {} if model.field is None else model.field.owned
+    for name, owned in host_params.items():
         rows = _bad_rows(params[name])
         if bool(rows.any()):
             messages.append(f"mended {_counted(int(rows.sum()), 'Gaussian')} ({name} not finite)")

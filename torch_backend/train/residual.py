@@ -70,8 +70,8 @@ def likely_movers(residual: Tensor, weight: Tensor) -> Tensor:
     seen = (weight > 0.5).float()
     value = (residual - (residual * seen).sum(0) / seen.sum(0).clamp_min(1.0)) * seen
     pairs = (seen[2:] * seen[:-2]).sum(0)
-    alike = torch.where(pairs >= 4, (value[2:] * value[:-2]).sum(0) / pairs.clamp_min(1.0), -torch.inf)
-    return alike.topk(min(len(alike), max(64, len(alike) // 10))).indices
+    correlation = torch.where(pairs >= 4, (value[2:] * value[:-2]).sum(0) / pairs.clamp_min(1.0), -torch.inf)
+    return correlation.topk(min(len(correlation), max(64, len(correlation) // 10))).indices
 
 
 def correlation_frames(residual: Tensor, weight: Tensor) -> float | None:
@@ -90,15 +90,15 @@ def correlation_frames(residual: Tensor, weight: Tensor) -> float | None:
         pairs = float((seen[later] * seen[earlier]).sum())
         return float((value[later] * value[earlier]).sum()) / pairs if pairs else None
 
-    alone, next_one = agreement(0), agreement(1)
-    if not alone or next_one is None or next_one < 0.1 * alone:
+    variance, first = agreement(0), agreement(1)
+    if not variance or first is None or first < 0.1 * variance:
         return None
-    before = next_one
+    before = first
     for lag in range(2, max(3, len(value) // 2 + 1)):
         agreed = agreement(lag)
         if agreed is None:
             return float(lag - 1)
-        if agreed < 0.5 * next_one:
-            return lag - 1 + (before - 0.5 * next_one) / (before - agreed)
+        if agreed < 0.5 * first:
+            return lag - 1 + (before - 0.5 * first) / (before - agreed)
         before = agreed
     return len(value) / 2

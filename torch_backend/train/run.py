@@ -37,7 +37,7 @@ from .config import TrainConfig, config_from_json, config_from_params, config_to
 from .depth import FittedDepth, depth_key, fitted_depth, load_fitted
 from .device import choose_device
 from .extend import EXTENSION_FILE, pending
-from .identity import asked_for, depth_identity, finished, of_other_pictures, pictures_key, solve_key
+from .identity import depth_identity, finished, has_changed_pictures, pictures_key, requested_identity, solve_key
 from .ignored import load_ignored
 from .loop import train_to_end
 from .memory import MemoryPlan, free_bytes, plan_memory
@@ -89,7 +89,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     finish_replacing(run)
     scene = load_scene(shot)
     sequence = find_depth(shot, params.depth, report) if params.depth else None
-    config, key, motion = asked_for(shot, scene, run, params, device, report, depth_identity(shot, sequence))
+    config, key, motion = requested_identity(shot, scene, run, params, device, report, depth_identity(shot, sequence))
     done = finished(run, key)
     if done is not None and params.resume:
         if sequence is not None:
@@ -124,7 +124,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     write_json(folder / SUMMARY_FILE, summary)
     if folder != run:
         replace_run(run, folder)
-    return _told(summary, report)
+    return _report_summary(summary, report)
 
 
 def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
@@ -139,7 +139,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     shot.own(folder / PREVIEWS_FOLDER)
     finish_replacing(folder)
     facts, before = _extendable(shot, params.run, folder)
-    checkpoint, beside = folder / CHECKPOINT_FILE, folder / EXTENSION_FILE
+    checkpoint, extension = folder / CHECKPOINT_FILE, folder / EXTENSION_FILE
     config, scene = config_from_json(facts["config"]), load_scene(shot)
     device = choose_device(params.device, report, "Training")
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
@@ -152,7 +152,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if before["iterations"] != facts["iteration"]:  # killed after the checkpoint: only the summary is missing
         restore_run(trainer, checkpoint)
     elif begun is not None and begun.steps == params.extend:
-        restore_run(trainer, beside)
+        restore_run(trainer, extension)
         done = trainer.iteration - begun.from_iteration
         report.progress("training", done, begun.steps, f"resumed at step {trainer.iteration}")
     else:
@@ -160,26 +160,26 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
             report.warning(f"{begun.steps} steps were begun, {params.extend} are asked for: they begin anew.")
         restore_run(trainer, checkpoint)
         trainer.extend(params.extend, before["heldout_psnr_db"])
-    summary = prepared.trained(shot, params.run, folder, beside, trainer.iteration)
+    summary = prepared.trained(shot, params.run, folder, extension, trainer.iteration)
     save_run(trainer, checkpoint)
     write_json(folder / SUMMARY_FILE, summary)
-    remove_file(beside)
-    return _told(summary, report)
+    remove_file(extension)
+    return _report_summary(summary, report)
 
 
 def _extendable(shot: Shot, run: str, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """(facts of the checkpoint, summary) of a run that can be extended. JobError if it cannot."""
-    again, checkpoint = "Train it without --extend first.", folder / CHECKPOINT_FILE
+    hint, checkpoint = "Train it without --extend first.", folder / CHECKPOINT_FILE
     facts = read_meta(checkpoint) if checkpoint.is_file() else {}
     if not facts:
-        raise JobError(f"{shot.root.name} has no trained run {run!r} to extend.", again, ExitCode.TRAIN)
+        raise JobError(f"{shot.root.name} has no trained run {run!r} to extend.", hint, ExitCode.TRAIN)
     before = read_json(folder / SUMMARY_FILE) if (folder / SUMMARY_FILE).is_file() else {}
     if before.get("key") != facts["key"]:
-        raise JobError(f"The run {run!r} is not finished: it cannot be extended yet.", again, ExitCode.TRAIN)
+        raise JobError(f"The run {run!r} is not finished: it cannot be extended yet.", hint, ExitCode.TRAIN)
     if facts["solve"] != solve_key(shot):
         message = f"The run {run!r} was trained on other cameras than the shot has now: it cannot be extended."
         raise JobError(message, "Remove the run or name another one, then train.", ExitCode.TRAIN)
-    if of_other_pictures(shot, facts):
+    if has_changed_pictures(shot, facts):
         message = f"The run {run!r} was trained on other pictures than the shot has now: it cannot be extended."
         raise JobError(message, "Train it again.", ExitCode.TRAIN)
     motion = facts.get("motion")  # also None for runs of versions that did not use mattes
@@ -218,7 +218,7 @@ def _prepared(
     return _Prepared(trainer, test, images[len(train) :])
 
 
-def _told(summary: dict[str, Any], report: Reporter) -> dict[str, Any]:
+def _report_summary(summary: dict[str, Any], report: Reporter) -> dict[str, Any]:
     """Reports a summary and warns of a poor run; returns the summary."""
     report.metric("train", summary)
     warn_if_poor(summary, report)

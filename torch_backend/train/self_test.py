@@ -122,8 +122,8 @@ def _problem(found: SelfTest, compare: Callable[[], list[Check]]) -> str:
         found.lasting = False
         return f"it could not be tested ({str(error) or type(error).__name__})"
     except Exception as error:  # any error of a driver, compiler or kernel is a result of the test
-        words = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        return f"a kernel does not build or run on it ({words})"
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        return f"a kernel does not build or run on it ({reason})"
     found.checks += checks
     wrong = next((check for check in checks if not check.error <= check.bound), None)
     if wrong is None:
@@ -141,7 +141,7 @@ def card_verdict(folder: Path | None = None, test: Callable[[str], SelfTest] | N
     place, key = (folder or kernel_folder()) / "splannequin-card.json", self_test_key()
     found = _kept(place)
     if found is None or found.key != key:
-        test = test or tested_apart
+        test = test or run_in_child
         first = found = test(key)
         if first.lasting and first.failed:
             found = test(key)
@@ -175,7 +175,7 @@ def _kept(place: Path) -> SelfTest | None:
         return None
 
 
-def tested_apart(key: str) -> SelfTest:
+def run_in_child(key: str) -> SelfTest:
     """Runs the self-test in a child process."""
     command = python_child(sys.executable, "torch_backend", "doctor", "--gpu")
     root = str(Path(__file__).resolve().parents[2])
@@ -258,8 +258,8 @@ def _frame(device: torch.device) -> list[Check]:
     """Compares projection, tiling and blending, forward and backward."""
     truth, true_gradients = _rendered(torch.device("cpu"), "cpu")
     seen, gradients = _rendered(device, "cuda")
-    off = (seen.colors.detach().cpu() - truth.colors.detach()).abs().amax(-1)
-    flipped = float((~(off <= _PIXEL)).float().mean())  # counts NaN as different
+    errors = (seen.colors.detach().cpu() - truth.colors.detach()).abs().amax(-1)
+    flipped = float((~(errors <= _PIXEL)).float().mean())  # counts NaN as different
     checks = [Check("a frame", flipped, _FLIPPED)]
     checks += [
         Check(f"the gradient of {name}", _relative(gradients[name], value), _GRADIENT)
@@ -274,18 +274,18 @@ def _loss(device: torch.device) -> list[Check]:
     image, target = torch.rand(2, 40, 56, 3, generator=g, device="cpu")
     ignored = torch.rand(40, 56, generator=g, device="cpu") > 0.9
 
-    def compared(what: str, bodies: tuple[Callable[..., Tensor], Callable[..., Tensor]], *more: Any) -> list[Check]:
+    def compared(name: str, bodies: tuple[Callable[..., Tensor], Callable[..., Tensor]], *more: Any) -> list[Check]:
         found: list[tuple[Tensor, Tensor]] = []
-        for where, body in zip((torch.device("cpu"), device), bodies, strict=True):
-            leaf = image.to(where, copy=True).requires_grad_()
-            there = [each.to(where) if isinstance(each, Tensor) else each for each in more]
-            value = body(leaf, target.to(where), *there)
+        for run_device, body in zip((torch.device("cpu"), device), bodies, strict=True):
+            leaf = image.to(run_device, copy=True).requires_grad_()
+            inputs = [value.to(run_device) if isinstance(value, Tensor) else value for value in more]
+            value = body(leaf, target.to(run_device), *inputs)
             backward(value)
             found.append((value, _gradient(leaf)))
-        (value, gradient), (here, gradient_here) = found
+        (value, gradient), (device_value, device_gradient) = found
         return [
-            Check(what, _relative(here, value), _EXACT),
-            Check(f"the gradient of {what}", _relative(gradient_here, gradient), _EXACT),
+            Check(name, _relative(device_value, value), _EXACT),
+            Check(f"the gradient of {name}", _relative(device_gradient, gradient), _EXACT),
         ]
 
     checks = compared("SSIM", (ssim.ssim, ssim_cuda.ssim))
@@ -297,11 +297,11 @@ def _adam(device: torch.device) -> list[Check]:
     g = torch.Generator(device="cpu").manual_seed(5)
     start, *gradients = torch.randn(3, 5000, 3, generator=g, device="cpu")
     found: list[Tensor] = []
-    for where, kernel in ((torch.device("cpu"), False), (device, True)):
-        parameter = torch.nn.Parameter(start.to(where, copy=True))
+    for run_device, kernel in ((torch.device("cpu"), False), (device, True)):
+        parameter = torch.nn.Parameter(start.to(run_device, copy=True))
         optimizer = FusedAdam([{"params": [parameter], "reach": 2.0}], lr=0.1, kernel=kernel)
         for gradient in gradients:
-            parameter.grad = gradient.to(where)
+            parameter.grad = gradient.to(run_device)
             optimizer.step()
         found.append(parameter.detach().cpu() - start)
     return [Check("a step of Adam", _relative(found[1], found[0]), _EXACT)]
@@ -343,14 +343,14 @@ def _planes(device: torch.device) -> list[Check]:
     g = torch.Generator(device="cpu").manual_seed(6)
     sizes = [(9, 11), (9, 7), (11, 7), (5, 9), (5, 11), (5, 7)]
     at = 2.4 * torch.rand(257, 4, generator=g, device="cpu") - 1.2
-    made = [torch.rand(1, planes.LANES, *size, generator=g, device="cpu") + 0.5 for size in sizes]
+    samples = [torch.rand(1, planes.LANES, *size, generator=g, device="cpu") + 0.5 for size in sizes]
     pull = torch.randn(len(at), planes.LANES, generator=g, device="cpu")
     found: list[dict[str, Tensor]] = []
-    for where, body in ((torch.device("cpu"), planes), (device, planes_cuda)):
-        leaves = [p.to(where).contiguous(memory_format=torch.channels_last).requires_grad_() for p in made]
-        points = at.to(where, copy=True).requires_grad_()
+    for run_device, body in ((torch.device("cpu"), planes), (device, planes_cuda)):
+        leaves = [p.to(run_device).contiguous(memory_format=torch.channels_last).requires_grad_() for p in samples]
+        points = at.to(run_device, copy=True).requires_grad_()
         features = body.features(points, leaves)
-        backward((features * pull.to(where)).sum())
+        backward((features * pull.to(run_device)).sum())
         results = {"the field": features, "the gradient of its points": _gradient(points)}
         results["the gradient of its planes"] = _gradients(leaves)
         for leaf in leaves:
@@ -359,7 +359,7 @@ def _planes(device: torch.device) -> list[Check]:
         backward(value)
         found.append({**results, "the field's smoothness": value, "the gradient of its smoothness": _gradients(leaves)})
     truth, seen = found
-    return [Check(what, _relative(seen[what], value), _EXACT) for what, value in truth.items()]
+    return [Check(name, _relative(seen[name], value), _EXACT) for name, value in truth.items()]
 
 
 def _gradient(leaf: Tensor) -> Tensor:

@@ -44,8 +44,8 @@ class SoftenedMovers:
     def movers_at(self, frame: int, progress: float) -> Tensor | None:
         """bool [H, W] moving pixels of the training frame at position `frame`; None if they have full resolution at
         `progress` (share of the run)."""
-        due = self.movers is not None and self.span[0] <= progress < self.span[1] and self._any[frame] > 0
-        return self.movers[frame] if due and self.movers is not None else None
+        is_active = self.movers is not None and self.span[0] <= progress < self.span[1] and self._any[frame] > 0
+        return self.movers[frame] if is_active and self.movers is not None else None
 
     def loss(
         self, image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None, movers: Tensor | None

@@ -108,7 +108,7 @@ class Soundness:
         model = run.model
         done = repair(model, run.optimizer, run.densifier, self.memory, run.iteration)
         if model.field is not None and not done:
-            done = self.memory.put_back(model.field, run.optimizer)
+            done = self.memory.restore_stable(model.field, run.optimizer)
         bad = [] if done or not (skipped or gradients) else self._bad_images(run)
         if bad:
             self.unusable.update(bad)

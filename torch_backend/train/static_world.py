@@ -55,15 +55,15 @@ def static_views(shot: Shot, report: Reporter) -> StaticViews:
     index = {frame: n for n, frame in enumerate(scene.frames)}
 
     @torch.no_grad()
-    def shown(frame: int) -> NDArray[np.uint8]:
+    def rendered(frame: int) -> NDArray[np.uint8]:
         return (trainer.render_frame(index[frame]).clamp(0.0, 1.0) * 255.0).round().byte().numpy()
 
-    return shown
+    return rendered
 
 
 def steps_for(frames: int) -> int:
     """Number of training steps for a static model of `frames` frames."""
-    least, most = (each * frames for each in PER_FRAME)
+    least, most = (per_frame * frames for per_frame in PER_FRAME)
     return min(max(STEPS, least), most)
 
 

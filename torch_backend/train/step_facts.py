@@ -68,7 +68,7 @@ class StepFacts:
     """[2, H, W] target inverse depth (0: no target) and its standard deviation; None: no targets."""
 
     @property
-    def asked(self) -> Tensor:
+    def field_time(self) -> Tensor:
         """[1] float32 normalised time at which the field is evaluated."""
         return self.numbers[:1]
 
@@ -99,11 +99,11 @@ class StepFacts:
 
     def on(self, device: torch.device) -> StepFacts:
         """Copy of all tensors on `device`."""
-        return self._made(lambda t: t.to(device, non_blocking=True))
+        return self._mapped(lambda t: t.to(device, non_blocking=True))
 
     def room(self, device: torch.device) -> StepFacts:
         """Uninitialised tensors of the same shapes on `device`, to be filled by `into`."""
-        return self._made(lambda t: torch.empty(t.shape, dtype=t.dtype, device=device))
+        return self._mapped(lambda t: torch.empty(t.shape, dtype=t.dtype, device=device))
 
     def into(self, room: StepFacts) -> None:
         """Copies all tensors into `room`, which was allocated for a step of the same kind."""
@@ -116,7 +116,7 @@ class StepFacts:
         found += [t for t in (self.ignored, self.movers, self.depth) if t is not None]
         return [*found, *(() if self.draws is None else self.draws.tensors())]
 
-    def _made(self, make: Callable[[Tensor], Tensor]) -> StepFacts:
+    def _mapped(self, make: Callable[[Tensor], Tensor]) -> StepFacts:
         def of(value: Tensor | None) -> Tensor | None:
             return None if value is None else make(value)
 

@@ -30,7 +30,7 @@ import numpy as np
 from torch import Tensor
 
 _LEAST_PROBES, _MOST_PROBES = 3, 12
-_GROWN = 1.5
+_MIN_GROWTH = 1.5
 """Least growth factor of the number of Gaussians over the measurements by which growth is judged."""
 _POINTS = 4
 """Least number of measurements by which growth is judged."""
@@ -77,11 +77,11 @@ def growth_gain(measured: list[tuple[int, int, float]], steps: int = 0) -> float
     """Gain in dB per 10 % more Gaussians: slope of PSNR over log count. None if the number grew too little.
 
     The slope is fitted to the fewest latest measurements (iteration, Gaussians, PSNR) that span a growth by the factor
-    `_GROWN` and `steps` iterations.
+    `_MIN_GROWTH` and `steps` iterations.
     """
     for first in range(len(measured) - _POINTS, -1, -1):
         iterations, counts, values = zip(*measured[first:], strict=True)
-        if counts[-1] >= _GROWN * counts[0] and iterations[-1] - iterations[0] >= steps:
+        if counts[-1] >= _MIN_GROWTH * counts[0] and iterations[-1] - iterations[0] >= steps:
             slope = np.polyfit(np.log(counts), values, 1)[0]
             return float(slope) * math.log(1.1)
     return None
@@ -266,7 +266,7 @@ class StoppingPolicy:
     # ------------------------------------------------------------------ results, for the trainer
 
     @property
-    def held(self) -> set[int]:
+    def excluded(self) -> set[int]:
         """Positions of the training frames that are currently kept back as probes."""
         return set() if self.joined else set(self.probes)
 
@@ -310,8 +310,8 @@ class StoppingPolicy:
         s = self.schedule
         grid = s.densify_every * max(1, round(self.config.every * s.iterations / s.densify_every))
         # Measured just before a round of densification, when the splits of the previous round have settled.
-        due = probe.iteration > 0 and probe.iteration % grid == 0
-        if due and self.stopped is None and (not self.measured or self.measured[-1][0] < probe.iteration):
+        is_due = probe.iteration > 0 and probe.iteration % grid == 0
+        if is_due and self.stopped is None and (not self.measured or self.measured[-1][0] < probe.iteration):
             self._measure(probe)
         if not self.joined:
             if self._excess_degree(probe):
@@ -355,11 +355,13 @@ class StoppingPolicy:
             return False
         if int(probe.progress / every) <= degree and probe.progress < self.config.join:
             return False
-        whole, cut = probe.probe_psnr(self.probes), probe.probe_psnr(self.probes, sh_degree=degree - 1)
-        if whole is None or cut is None:
+        full, reduced = probe.probe_psnr(self.probes), probe.probe_psnr(self.probes, sh_degree=degree - 1)
+        if full is None or reduced is None:
             return False
-        self.degrees[degree] = whole - cut
-        return (whole - cut) * lasting(degree * every, probe.progress, self.schedule.rates_end) <= self.config.sh_gain
+        self.degrees[degree] = full - reduced
+        return (full - reduced) * lasting(
+            degree * every, probe.progress, self.schedule.rates_end
+        ) <= self.config.sh_gain
 
     def judge_cameras(self, probe: Probe, refined: Tensor) -> None:
         """Measures the gain by refined cameras [F, 4, 4] before they replace the run's cameras."""
@@ -370,10 +372,10 @@ class StoppingPolicy:
 
     def _join(self, probe: Probe) -> None:
         """Measures the gain by exposure and field on the probes for the last time, then makes them training frames."""
-        whole = probe.probe_psnr(self.probes)
-        self.facts.exposure_gain_db = _difference(whole, probe.probe_psnr(self.probes, exposure=False))
-        self.facts.field_gain_db = _difference(whole, probe.probe_psnr(self.probes, field=False))
-        self.facts.probe_psnr_db = whole
+        psnr = probe.probe_psnr(self.probes)
+        self.facts.exposure_gain_db = _difference(psnr, probe.probe_psnr(self.probes, exposure=False))
+        self.facts.field_gain_db = _difference(psnr, probe.probe_psnr(self.probes, field=False))
+        self.facts.probe_psnr_db = psnr
         self.joined = True
 
     def time_nodes(self, probe: Probe) -> int:

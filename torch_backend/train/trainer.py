@@ -131,7 +131,7 @@ class Trainer:
     @property
     def excluded_frames(self) -> set[int]:
         """Positions among the training frames that are currently excluded: probe frames and unusable frames."""
-        return self.soundness.unusable | self.policy.held
+        return self.soundness.unusable | self.policy.excluded
 
     @property
     def gaussian_count(self) -> int:
@@ -173,25 +173,25 @@ class Trainer:
         or gradients are not finite is not applied."""
         frame = self._next_frame()
         self._schedule_rates()
-        kind, facts = self._told(frame)
+        kind, facts = self._step_inputs(frame)
         if self.recorder is not None:
             return self.recorder.step(kind, facts, frame)
         return self.carry_out(kind, facts.on(self.device), frame)
 
-    def _told(self, frame: int) -> tuple[StepKind, StepFacts]:
+    def _step_inputs(self, frame: int) -> tuple[StepKind, StepFacts]:
         """Kind and inputs of the next step, on the training frame at position `frame`. All random numbers of a
         recordable step are drawn in this function; other steps also draw in `carry_out`."""
         model, s, field, c = self.model, self.config.supervision, self.model.field, self.config
         rows, index, time = model.open_rows(), self.train_ids[frame], self.times[frame]
         draws = None
-        if field is not None and len(rows) and s.anchors_due(self.iteration, self.progress):
+        if field is not None and len(rows) and s.is_anchor_step(self.iteration, self.progress):
             draws = draw(len(rows), len(self.centres), s, self.generator)
         field_time = time if field is None else field.training_time(time, self.progress, self.generator)
         # A random background colour at every step penalises holes, which a fixed colour could hide.
         background = torch.rand(3, generator=self.generator, device="cpu")
         left, right, share = model.exposure.place(time)
-        due = self.targets is not None and self.iteration % self.targets.every == 0
-        depth = self.targets.at(frame) if due and self.targets is not None else None
+        is_due = self.targets is not None and self.iteration % self.targets.every == 0
+        depth = self.targets.at(frame) if is_due and self.targets is not None else None
         numbers = from_numpy(np.array([field_time, 1.0 - share, share, still_weight(self.progress, s)], np.float32))
         ignored = self.ignored.get(index)
         movers = self.softened.movers_at(frame, self.progress)
@@ -201,18 +201,18 @@ class Trainer:
             viewmat=self.viewmats[index], K=self.Ks[index], image=self.images[frame], ignored=ignored,
             movers=movers, draws=draws, depth=depth,
         )  # fmt: skip
-        asks = self._refines_poses() or (field is not None and s.paper_due(self.iteration, self.progress))
+        is_irregular = self._refines_poses() or (field is not None and s.is_paper_step(self.iteration, self.progress))
         kind = StepKind(
             sh_degree=model.sh_degree,
             moves=field is not None and len(rows) > 0,
             detached=self.progress < c.field.detached,
-            hidden=field is not None and s.hidden_due(self.iteration),
+            hidden=field is not None and s.is_hidden_step(self.iteration),
             anchored=draws is not None,
             penalised=self.iteration % c.field_every == 0,
             soft=movers is not None,
             ignored=ignored is not None,
             depth=depth is not None,
-            recordable=not asks and (field is None or field.recordable),
+            recordable=not is_irregular and (field is None or field.recordable),
         )
         return kind, facts
 
@@ -225,9 +225,9 @@ class Trainer:
         supervision, model = self.config.supervision, self.model
         rows = model.open_rows()
         pairs = None if facts.draws is None else anchored_pairs(model.gaussians, rows, facts.draws, supervision)
-        deltas, anchored = self._deltas(rows, facts.asked, pairs)
+        deltas, anchored = self._deltas(rows, facts.field_time, pairs)
         if deltas is not None:
-            self.soundness.memory.heed(deltas.means.detach())
+            self.soundness.memory.observe(deltas.means.detach())
         if deltas is not None and kind.detached:
             deltas = deltas.detached()
         state = model.moved(rows, deltas)
@@ -236,7 +236,7 @@ class Trainer:
             state, model.sh_degree, viewmat, facts.K, self.width, self.height, background=facts.background,
             with_depth=kind.hidden, with_contributions=True,
         )  # fmt: skip
-        paper = kind.moves and supervision.paper_due(self.iteration, self.progress)
+        paper = kind.moves and supervision.is_paper_step(self.iteration, self.progress)
         if paper:
             state["means"].retain_grad()
         exposed = model.exposure.apply_at(out.colors[0], facts.exposure_bins, facts.exposure_shares)
@@ -255,8 +255,8 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         backward(total)
         if paper:
-            other = paper_step(self, frame, rows, state, out)
-            self.soundness.trains_on(*([] if other is None else [other]))
+            second = paper_step(self, frame, rows, state, out)
+            self.soundness.trains_on(*([] if second is None else [second]))
         self.optimizer.step(guard=[total])
         if self._refines_poses():
             self.poses.fix_gauge(self.excluded_frames)
@@ -300,23 +300,23 @@ class Trainer:
             growth.gradient, growth.seen, self.model.exposure.values, self.poses.values, *model.params.values(),
         )  # fmt: skip
 
-    def _deltas(self, rows: Tensor, when: Tensor, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
-        """(deltas of `rows` at the frame's time `when` [1], deltas of the anchored `pairs`). One call of the field
-        computes both, unless the field requires separate calls on a GPU (`apart`)."""
+    def _deltas(self, rows: Tensor, time: Tensor, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
+        """(deltas of `rows` at the frame's `time` [1], deltas of the anchored `pairs`). One call of the field
+        computes both, unless the field requires separate calls on a GPU (`has_separate_calls`)."""
         field = self.model.field
         if field is None:
             return None, None
         if pairs is None:
-            return self.model.deltas(rows, when), None
-        times = torch.cat([when.expand(len(rows)), self.centres[pairs.bins]])
+            return self.model.deltas(rows, time), None
+        times = torch.cat([time.expand(len(rows)), self.centres[pairs.bins]])
         means = self.model.gaussians.params["means"]
         # Anchors train the field only: without `detach`, gradients through the field would also move the means.
-        where = torch.cat([means[rows], means.detach()[pairs.rows]])
-        if field.apart and self.device.type != "cpu":
-            anchored = field(where[len(rows) :], times[len(rows) :], self.model.gaussians.own(pairs.rows))
-            return self.model.deltas(rows, when), anchored
-        own = self.model.gaussians.own(torch.cat([rows, pairs.rows]))
-        return split_deltas(self.model.ask(field, where, times, own), len(rows))
+        positions = torch.cat([means[rows], means.detach()[pairs.rows]])
+        if field.has_separate_calls and self.device.type != "cpu":
+            anchored = field(positions[len(rows) :], times[len(rows) :], self.model.gaussians.host_params(pairs.rows))
+            return self.model.deltas(rows, time), anchored
+        host_params = self.model.gaussians.host_params(torch.cat([rows, pairs.rows]))
+        return split_deltas(self.model.evaluate(field, positions, times, host_params), len(rows))
 
     def image_of(self, frame: int) -> Tensor:
         """[H, W, 3] float32 image of the training frame at position `frame`, on the device."""
@@ -367,9 +367,9 @@ class Trainer:
 
     def _next_frame(self) -> int:
         if not self.order:
-            drawn = integers(torch.randperm(len(self.train_ids), generator=self.generator, device="cpu"))
+            shuffled = integers(torch.randperm(len(self.train_ids), generator=self.generator, device="cpu"))
             out = self.excluded_frames
-            self.order = [frame for frame in drawn if frame not in out]
+            self.order = [frame for frame in shuffled if frame not in out]
         self.soundness.trains_on(self.order[-1])
         return self.order.pop()
 
@@ -405,7 +405,7 @@ class Trainer:
         if self.iteration > self.end - round(self.config.average * length):
             self.mean.add(self.named_tensors())
         if self.iteration == self.end:
-            self.mean.put_into(self.named_tensors())
+            self.mean.copy_into(self.named_tensors())
 
     def _schedule_rates(self) -> None:
         schedule = self.extensions[-1] if self.extensions else self.policy

@@ -82,20 +82,20 @@ class RunFigures:
 
 def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int) -> RunFigures:
     """Figures of a run. `width`: width of the working frames; `pixels`: number of pixels of a training image."""
-    known = [one for one in seen if math.isfinite(one.psnr_db)]
-    kept = [one for one in known if one.held_out]
-    values = [one.psnr_db for one in kept or known] or [0.0]  # clips that are masked entirely are rejected earlier
-    moving = np.concatenate([one.moving for one in seen])
-    whole = len(seen) * pixels / 16  # `moving` has every 16th pixel
-    still = [one.still_unexplained for one in seen if one.still_unexplained is not None]
-    mattes = [one.matte_moving for one in seen if one.matte_moving is not None]
+    known = [row for row in seen if math.isfinite(row.psnr_db)]
+    kept = [row for row in known if row.held_out]
+    values = [row.psnr_db for row in kept or known] or [0.0]  # clips that are masked entirely are rejected earlier
+    moving = np.concatenate([row.moving for row in seen])
+    sampled = len(seen) * pixels / 16  # `moving` has every 16th pixel
+    still = [row.still_unexplained for row in seen if row.still_unexplained is not None]
+    mattes = [row.matte_moving for row in seen if row.matte_moving is not None]
     return RunFigures(
         width,
-        [one.frame for one in seen],
-        np.stack([one.unexplained for one in seen]),
-        np.stack([one.travel for one in seen]),
+        [row.frame for row in seen],
+        np.stack([row.unexplained for row in seen]),
+        np.stack([row.travel for row in seen]),
         float(np.percentile(moving, 95)) if len(moving) else 0.0,
-        float((moving > RunLimits.far).sum()) / whole,
+        float((moving > RunLimits.far).sum()) / sampled,
         float(np.percentile(moving, 99)) if len(moving) else 0.0,
         float(np.percentile(values, 50)),
         float(np.percentile(values, 10)),
@@ -139,14 +139,14 @@ def _sentences(
         )
     elif not places:
         sentences.append(EXPLAINED)
-    sentences += [f"It does not hold in {where_words(place)}." for place in places]
+    sentences += [f"It does not hold in {span_text(place)}." for place in places]
     if figures.learnt_no_motion(limits):
         share = 100.0 * (figures.matte_moving or 0.0)
         sentences.append(f"Nothing moves in it, but the motion mattes call {share:.0f} % of the frames moving.")
     elif figures.sway < limits.still:
         sentences.append("Nothing moves in it.")
     elif walks:
-        farthest, place = round(figures.farthest * width), where_words(walks[0])
+        farthest, place = round(figures.farthest * width), span_text(walks[0])
         sentences.append(f"Something does not hold still: it travels up to {farthest} of {width} pixels in {place}.")
     else:
         sentences.append(f"What moves sways by up to {max(1, round(figures.sway * width))} of {width} pixels.")
@@ -193,7 +193,7 @@ _REGIONS = (
 )
 
 
-def region_words(cells: NDArray[np.floating]) -> str:
+def region_text(cells: NDArray[np.floating]) -> str:
     """Region of the image where the weight of cells [GRID, GRID] (top row first) is centred, such as "lower left"."""
     weights = np.asarray(cells, np.float64)
     total = weights.sum()
@@ -227,13 +227,13 @@ def spans_of(
         {
             "first": int(frames[int(groups[n][0])]),
             "last": int(frames[int(groups[n][-1])]),
-            "region": region_words(weights[n]),
+            "region": region_text(weights[n]),
         }
         for n in worst
     ]
 
 
-def where_words(place: dict[str, Any]) -> str:
+def span_text(place: dict[str, Any]) -> str:
     """A span of `spans_of` in words, for instance 'frames 10 to 30, lower left'."""
     if place["first"] == place["last"]:
         return f"frame {place['first']}, {place['region']}"

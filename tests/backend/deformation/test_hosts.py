@@ -235,7 +235,7 @@ class Sway(Deformation):
         self.config = config
         self.reach = torch.nn.Parameter(torch.zeros(3))
 
-    def forward(self, means, times, own=None):
+    def forward(self, means, times, host_params=None):
         return Deltas(means=times.expand(len(means))[:, None] * self.reach)
 
     def parameter_groups(self):

@@ -17,7 +17,7 @@ from torch_backend.freeze.exr import (
     HALF_MAX,
     DetailLayers,
     FrameMetadata,
-    Made,
+    LazyLayer,
     read_frozen_exr,
     read_key,
     write_frozen_exr,
@@ -73,7 +73,7 @@ def detail_of(stored: dict, seed: int = 2) -> DetailLayers:
 
 
 def made(array):
-    return Made(array.shape, lambda rows: array[rows].astype(np.float64))
+    return LazyLayer(array.shape, lambda rows: array[rows].astype(np.float64))
 
 
 def test_layers_made_while_they_are_written_give_the_same_file(tmp_path):
@@ -99,9 +99,9 @@ def test_a_wrong_layer_made_while_it_is_written_leaves_no_file(tmp_path):
 
 def test_layers_made_while_they_are_written_are_never_whole_in_memory(tmp_path):
     height, width = 3000, 500
-    flat = {name: Made((height, width), lambda rows: np.full((min(rows.stop, height) - rows.start, width), 0.5))
+    flat = {name: LazyLayer((height, width), lambda rows: np.full((min(rows.stop, height) - rows.start, width), 0.5))
             for name in ("depth", "support", "motion")}  # fmt: skip
-    rgba = Made((height, width, 4), lambda rows: np.full((min(rows.stop, height) - rows.start, width, 4), 0.5))
+    rgba = LazyLayer((height, width, 4), lambda rows: np.full((min(rows.stop, height) - rows.start, width, 4), 0.5))
     tracemalloc.start()
     write_frozen_exr(tmp_path / "a.exr", rgba, metadata=METADATA, **flat)
     peak = tracemalloc.get_traced_memory()[1]

@@ -118,7 +118,7 @@ def test_a_hosts_own_parameters_ride_through_growth_and_checkpoints():
     assert torch.equal(optimizer.state[grown]["exp_avg"][[0, 1, 3]], moments[[0, 3, 5]])
     assert not bool(optimizer.state[grown]["exp_avg"][2].any())
     assert torch.nonzero(model.hidden).tolist() == [[1, 5], [2, 5]]
-    assert torch.equal(model.own(torch.tensor([2]))["hyper"], grown[2:3])
+    assert torch.equal(model.host_params(torch.tensor([2]))["hyper"], grown[2:3])
     again = Gaussians.from_state(model.state(), 11)
     assert torch.equal(again.params["hyper"], grown)
     assert torch.equal(again.hidden, model.hidden)

@@ -90,7 +90,7 @@ class Ramp:
     def __init__(self):
         self.slope = torch.tensor(1.0, requires_grad=True)
 
-    def __call__(self, means, times, own=None):
+    def __call__(self, means, times, host_params=None):
         count = len(means)
         shift = torch.zeros(count, 3)
         shift[:, 0] = 1.0

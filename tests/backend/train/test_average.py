@@ -15,7 +15,7 @@ def test_the_mean_is_that_of_the_steps_after_the_last_change_of_shape():
         mean.add(step)
     assert mean.count == 40
     kept = {"a": torch.zeros(5, 3), "b": torch.zeros(2)}
-    mean.put_into(kept)
+    mean.copy_into(kept)
     for name, value in kept.items():
         exact = torch.stack([step[name].double() for step in steps]).mean(0)
         torch.testing.assert_close(value.double(), exact, rtol=1e-5, atol=1e-6)
@@ -36,8 +36,8 @@ def test_a_mean_goes_on_where_it_was_saved():
         if n == 5:
             second.restore(first.state(), torch.device("cpu"))
     kept, expected = {"a": torch.zeros(4)}, {"a": torch.zeros(4)}
-    second.put_into(kept)
-    whole.put_into(expected)
+    second.copy_into(kept)
+    whole.copy_into(expected)
     assert torch.equal(kept["a"], expected["a"])
 
 
@@ -45,11 +45,11 @@ def test_what_is_not_finite_once_does_not_spoil_what_is_kept():
     mean, kept = ParameterMean(), {"a": torch.tensor([5.0, 6.0])}
     mean.add({"a": torch.tensor([1.0, torch.nan])})
     mean.add({"a": torch.tensor([3.0, 2.0])})
-    mean.put_into(kept)
+    mean.copy_into(kept)
     assert kept["a"].tolist() == [2.0, 6.0]
 
 
 def test_without_a_step_nothing_changes():
     mean, kept = ParameterMean(), {"a": torch.tensor([5.0])}
-    mean.put_into(kept)
+    mean.copy_into(kept)
     assert kept["a"].item() == 5.0

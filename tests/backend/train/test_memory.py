@@ -30,7 +30,7 @@ def test_what_is_planned_fits(card_gb, method):
     config = config_from_params(TrainParams(preset="final", method=method))
     frames = IMAGES if found.on_card else 0
     whole = found.pieces is None
-    needed = peak_bytes(config, SIZE[0] * SIZE[1], FRAMES, found.gaussians, whole=whole, frames=frames)
+    needed = peak_bytes(config, SIZE[0] * SIZE[1], FRAMES, found.gaussians, is_single_call=whole, frames=frames)
     assert needed * 1.15 + 450e6 <= card_gb * 1e9 - DESKTOP
     assert found.gaussians <= 1_000_000
 

@@ -113,14 +113,14 @@ def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(sh
     with pytest.raises(Cancelled):
         train_shot(shot, asked, quiet(cancel_at=("training", 0.1)))
     report = quiet()
-    config, key, _ = identity.asked_for(shot, scene, shot.run("f"), asked, card, report, [])
+    config, key, _ = identity.requested_identity(shot, scene, shot.run("f"), asked, card, report, [])
     assert not config.plates and key == json.loads((shot.run("f") / "config.json").read_text())["key"]
     assert [event[1] for event in report.events] == [
         "The run was begun with the preset's numbers for the processor: it goes on with them."
     ]
     again = TrainParams(**{**vars(asked), "resume": False})
-    assert identity.asked_for(shot, scene, shot.run("f"), again, card, quiet(), [])[0].plates
-    assert identity.asked_for(shot, scene, shot.run("another"), asked, card, quiet(), [])[0].plates
+    assert identity.requested_identity(shot, scene, shot.run("f"), again, card, quiet(), [])[0].plates
+    assert identity.requested_identity(shot, scene, shot.run("another"), asked, card, quiet(), [])[0].plates
 
     on_card = TrainParams(**{**vars(asked), "run": "c"})
     with monkeypatch.context() as patched, pytest.raises(Cancelled):

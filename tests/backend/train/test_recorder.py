@@ -143,7 +143,7 @@ def test_recordings_go_when_steps_come_that_cannot_be_recorded(trained):
     recording = Again()
     recorded = trained(recording, steps=9)
     assert recorded.recorder._recorded
-    kind, facts = recorded._told(0)
+    kind, facts = recorded._step_inputs(0)
     recorded.model.gaussians.rebuild(
         torch.arange(len(recorded.model.gaussians)), torch.zeros(len(recorded.model.gaussians), dtype=torch.bool),
         recorded.optimizer,

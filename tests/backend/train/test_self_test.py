@@ -201,7 +201,7 @@ def test_a_card_that_fails_is_not_used_and_said(monkeypatch):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
 def test_a_test_in_another_process_comes_back(tmp_path: Path):
-    found = self_test.tested_apart("of this key")
+    found = self_test.run_in_child("of this key")
     assert found.key == "of this key" and not found.lasting
     assert found.problem == device.cuda_refusal()
     self_test.keep(dataclasses.replace(found, lasting=True), tmp_path, confirmed=True)

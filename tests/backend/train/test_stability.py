@@ -15,7 +15,7 @@ from torch_backend.train import config_from_params
 from torch_backend.train.adam import FusedAdam
 from torch_backend.train.events import harden_gate, open_gate, schedule_events
 from torch_backend.train.optimizer import add_field, schedule_rates
-from torch_backend.train.repair import drop_thrown, repair
+from torch_backend.train.repair import drop_displaced, repair
 from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
 
@@ -241,8 +241,8 @@ def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(b
     means = trainer.model.gaussians.params["means"].detach()[trainer.model.open_rows()]
     shift = torch.zeros_like(means)
     shift[: round(share * len(means)), 0] = times * (means - means.median(0).values).norm(dim=1).median()
-    trainer.soundness.memory.heed(shift)
-    trainer.soundness.memory.heed(torch.zeros_like(means))
+    trainer.soundness.memory.observe(shift)
+    trainer.soundness.memory.observe(torch.zeros_like(means))
     trainer.inspect_nonfinite()
     assert len(warnings(trainer)) == said
 
@@ -270,15 +270,15 @@ def bound_between(trainer: Trainer, count: int) -> torch.Tensor:
 def test_who_is_thrown_out_of_its_place_is_dropped_and_nobody_else(begin):
     trainer = begin("hexplane", 30)
     model, memory = trainer.model, trainer.soundness.memory
-    assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 0
+    assert drop_displaced(model, trainer.optimizer, trainer.densifier, memory) == 0
     thrown = bound_between(trainer, 7)
     expected = {name: p.detach()[~thrown].clone() for name, p in model.gaussians.params.items()}
     gradient = trainer.densifier.gradient[~thrown].clone()
-    assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 7
+    assert drop_displaced(model, trainer.optimizer, trainer.densifier, memory) == 7
     for name, p in model.gaussians.params.items():
         assert torch.equal(p, expected[name]), name
     assert torch.equal(trainer.densifier.gradient, gradient)
-    assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 0
+    assert drop_displaced(model, trainer.optimizer, trainer.densifier, memory) == 0
     assert len(go_on(trainer, 20)) == 20
     assert not warnings(trainer)
 
@@ -305,14 +305,14 @@ def test_a_small_thing_may_move_by_many_times_its_size(begin):
     trainer = begin("hexplane", 30)
     means = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)) * 0.02
     trainer.soundness.memory.keep(trainer.model.field, means)
-    trainer.soundness.memory.heed(torch.full_like(means, 0.9))
+    trainer.soundness.memory.observe(torch.full_like(means, 0.9))
     trainer.inspect_nonfinite()
     assert not warnings(trainer)
 
 
 def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin, tmp_path):
     trainer = begin("hexplane", 30)
-    trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
+    trainer.soundness.memory.observe(torch.full((len(trainer.model.open_rows()), 3), 1e6))
     trainer.inspect_nonfinite()
     save_run(trainer, tmp_path / "checkpoint.safetensors")
     resumed = begin("hexplane", 0)
@@ -326,16 +326,16 @@ def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin
 def test_a_resumed_run_drops_who_is_thrown_as_an_unbroken_one_does(begin, tmp_path):
     """Without a stored bound it would drop nothing until its next inspection, and a round of growth may come first."""
     trainer = begin("hexplane", 30)
-    trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
+    trainer.soundness.memory.observe(torch.full((len(trainer.model.open_rows()), 3), 1e6))
     worst = float(trainer.soundness.memory._worst)
     thrown = bound_between(trainer, 5)
     save_run(trainer, tmp_path / "checkpoint.safetensors")
     resumed = begin("hexplane", 0)
     restore_run(resumed, tmp_path / "checkpoint.safetensors")
     memory = resumed.soundness.memory
-    assert drop_thrown(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(thrown.sum())
-    assert worst > 0 and "put the field back" in memory.put_back(resumed.model.field, resumed.optimizer)
-    assert trainer.soundness.memory.put_back(trainer.model.field, trainer.optimizer)
+    assert drop_displaced(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(thrown.sum())
+    assert worst > 0 and "put the field back" in memory.restore_stable(resumed.model.field, resumed.optimizer)
+    assert trainer.soundness.memory.restore_stable(trainer.model.field, trainer.optimizer)
     for (name, p), (_, other) in zip(trainer.model.field.named_parameters(), resumed.model.field.named_parameters()):
         assert torch.equal(p, other), name
 

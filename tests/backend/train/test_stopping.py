@@ -254,7 +254,7 @@ def test_what_a_degree_was_dropped_from_is_what_joins():
     policy, run = policy_of(sh_gain=0.1), Numbers(60)
     for decision in policy.decide(run):
         run.sh_degree = decision.degree
-    assert policy.held == set()
+    assert policy.excluded == set()
     facts = policy.facts
     assert facts.probe_psnr_db == 20.0
     assert (facts.exposure_gain_db, facts.field_gain_db) == (pytest.approx(0.3), pytest.approx(0.2))
@@ -332,9 +332,9 @@ def test_published_hosts_are_left_alone(long_world, quiet):
     for params in (TrainParams(method="hexplane"), TrainParams(host_config="reference")):
         trainer = Trainer(scene, images, scene.solved, config_from_params(params), quiet())
         assert trainer.policy.probes == []
-        assert trainer.policy.held == set()
+        assert trainer.policy.excluded == set()
     for method in ("auto", "static"):  # the methods are compared with each other, so both use the policy
-        assert trainer_of(long_world, quiet, method=method).policy.held == set(probe_frames(len(scene.solved), 12))
+        assert trainer_of(long_world, quiet, method=method).policy.excluded == set(probe_frames(len(scene.solved), 12))
 
 
 def test_time_nodes_follow_the_motion(long_world, quiet, tmp_path):

@@ -12,7 +12,7 @@ from torch_backend.contract import TrainParams, read_json, verdict_lines
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.train import train_shot
 from torch_backend.train.evidence import GRID, travelled, unexplained
-from torch_backend.train.verdict import RunFigures, judge, region_words, spans_of, where_words
+from torch_backend.train.verdict import RunFigures, judge, region_text, span_text, spans_of
 
 FRAMES = list(range(1, 75, 3))
 
@@ -97,13 +97,13 @@ def test_regions_and_frames_in_words():
     }.items():  # fmt: skip
         one = cells.copy()
         one[row, column] = 1.0
-        assert region_words(one) == expected
-    assert region_words(cells + 1.0) == region_words(cells) == "most of the picture"
+        assert region_text(one) == expected
+    assert region_text(cells + 1.0) == region_text(cells) == "most of the picture"
     shares = lost_at(4, 7, 0, 0) + lost_at(40, 61, 3, 3) - 0.02
     shares[FRAMES.index(49)] = 0.0  # one good frame does not split a span
     spans = spans_of(FRAMES, shares, shares > 0.3)
-    assert [where_words(span) for span in spans] == ["frames 40 to 61, lower right", "frames 4 to 7, upper left"]
-    assert where_words({"first": 4, "last": 4, "region": "top"}) == "frame 4, top"
+    assert [span_text(span) for span in spans] == ["frames 40 to 61, lower right", "frames 4 to 7, upper left"]
+    assert span_text({"first": 4, "last": 4, "region": "top"}) == "frame 4, top"
     assert spans_of(FRAMES, shares, shares > 2.0) == []
 
 

@@ -42,7 +42,7 @@ from .primary_source import PrimaryMatte, primary_matte, primary_plate
 from .transfer import to_display, to_linear
 from .warp import sample
 
-_NOTHING = 0.5 / 1024.0
+_MIN_MATTE = 0.5 / 1024.0
 """Largest matte that rounds to 0 in steps of 1/1024."""
 
 
@@ -113,7 +113,7 @@ class Compositor:
         self.run, self.scene, self.plates = run, scene, plates
         self.config = config or CompositeConfig()
         self._moving, self._bars = moving, bars
-        self.seen = SourceViews(run, scene, plates, moving, self.config.source_views)
+        self.source_views = SourceViews(run, scene, plates, moving, self.config.source_views)
         """The plates compared with the current model, which is the run or a developed instant."""
 
     @torch.no_grad()
@@ -136,20 +136,20 @@ class Compositor:
             withheld: frames whose plates must not be used.
         """
         self._turn_to(frozen, output.t_star)
-        target = target_view(self.seen, output, frozen, image, width, height)
-        usable = [frame for frame in self.seen.frames if frame not in withheld]
-        primary = primary_plate(self.seen, output, target, usable)
-        primary_part = primary_matte(self.seen, self.config, output, target, primary, usable, (width, height))
+        target = target_view(self.source_views, output, frozen, image, width, height)
+        usable = [frame for frame in self.source_views.frames if frame not in withheld]
+        primary = primary_plate(self.source_views, output, target, usable)
+        primary_part = primary_matte(self.source_views, self.config, output, target, primary, usable, (width, height))
         bars = (
             self._keep_bars(primary_part.matte, primary)
             if primary_part.is_identity and primary == output.frame
             else None
         )
-        fillers = fillers_of(self.seen, self.config, target, primary_part.matte, primary, usable)
-        made = self._mix_frame(target, primary, primary_part, fillers)
+        fillers = fillers_of(self.source_views, self.config, target, primary_part.matte, primary, usable)
+        composite = self._mix_frame(target, primary, primary_part, fillers)
         if bars is not None:  # bars look the same at every instant
-            made.support[bars], made.motion[bars] = 1.0, 0.0
-        return made
+            composite.support[bars], composite.motion[bars] = 1.0, 0.0
+        return composite
 
     def _keep_bars(self, matte: Tensor, frame: int) -> Tensor | None:
         """Sets `matte` [H, W] to 1 on the bars of a frame's own plate. Returns the bars, bool [H, W], or None."""
@@ -166,11 +166,13 @@ class Compositor:
     # ------------------------------------------------------------------------------------------------- the frame
 
     def _turn_to(self, frozen: FrozenGaussians, t_star: float) -> None:
-        """Recreates `seen` when the developed instant changes; frames of one instant are rendered in sequence."""
+        """Recreates `source_views` when the developed instant changes; frames of an instant come in sequence."""
         developed = frozen if frozen.descent is not None else None
-        if developed is not self.seen.stage.developed:
+        if developed is not self.source_views.stage.developed:
             config = self.config.source_views
-            self.seen = SourceViews(self.run, self.scene, self.plates, self._moving, config, developed, round(t_star))
+            self.source_views = SourceViews(
+                self.run, self.scene, self.plates, self._moving, config, developed, round(t_star)
+            )
 
     # ------------------------------------------------------------------------------------------------- the mix
 
@@ -178,32 +180,32 @@ class Compositor:
         self,
         target: TargetView,
         primary: int,
-        given: PrimaryMatte,
+        primary_part: PrimaryMatte,
         fillers: Fillers | None,
     ) -> CompositeFrame:
-        image, matte, st, own = target.image, given.matte, given.st, given.is_identity
+        image, matte, st, is_identity = target.image, primary_part.matte, primary_part.st, primary_part.is_identity
         rows, columns = image.alpha.shape
         parts = bands(rows, columns)
         if len(parts) > 1:
             hand_back()
-        gives = bool((matte > _NOTHING).any())
-        plate = self.plates.linear(primary) if gives and not own else None
-        made = CompositeFrame(
+        has_primary = bool((matte > _MIN_MATTE).any())
+        plate = self.plates.linear(primary) if has_primary and not is_identity else None
+        composite = CompositeFrame(
             torch.empty(rows, columns, 3, device="cpu"), image.alpha.clone(), image.color, image.alpha,
             torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
-            torch.minimum(image.support, 1.0 - resized(target.unseen, columns, rows)),
+            torch.minimum(image.support, 1.0 - resized(target.out_of_view, columns, rows)),
             resized(target.moved, columns, rows), primary, st, matte, torch.zeros(rows, columns, 3, device="cpu"),
             self.scene.display,
-            terms={**given.terms, **_terms(target, fillers)},
+            terms={**primary_part.terms, **_terms(target, fillers)},
         )  # fmt: skip
         for band in parts:
-            filling = None if fillers is None else fill(self.seen, self.config, target, fillers, matte, band)
+            filling = None if fillers is None else fill(self.source_views, self.config, target, fillers, matte, band)
             matte[band] = (matte[band] * 1024.0).round() / 1024.0
             lead = sample(plate, st[band]) if plate is not None else None
-            if gives and own:
+            if has_primary and is_identity:
                 lead = self._placed(primary, rows, columns, band)
-            self._mix_rows(made, filling, lead, band)
-        return made
+            self._mix_rows(composite, filling, lead, band)
+        return composite
 
     def _placed(self, frame: int, rows: int, columns: int, band: slice) -> Tensor:
         """[h, columns, 3] scene-linear: rows `band` of a plate centred in `rows` x `columns` pixels, 0 around it."""
@@ -218,30 +220,30 @@ class Compositor:
             out[first - band.start : last - band.start, left : left + width] = part
         return out
 
-    def _mix_rows(self, made: CompositeFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
+    def _mix_rows(self, composite: CompositeFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
         """Mixes some rows of a frame. Its `matte` is final, and its `alpha` is that of the splats.
 
         `lead` [h, W, 3] holds the primary plate's pixels of these rows, scene-linear. None: the plate is not used.
         """
-        matte, alpha, fill = made.matte[rows], made.alpha[rows], made.fill[rows]
+        matte, alpha, fill = composite.matte[rows], composite.alpha[rows], composite.fill[rows]
         share = matte.clone()
-        source = torch.full_like(share, float(made.primary))
+        source = torch.full_like(share, float(composite.primary))
         if filling is not None:
             at = filling.y, filling.x
-            left = 1.0 - matte[at]
+            remaining = 1.0 - matte[at]
             alpha[at] += (1.0 - alpha[at]) * filling.share
             covered = torch.maximum(alpha, matte)[at].clamp_min(1e-4)[:, None]
             color = filling.color if self.plates.deep else filling.color.clamp(0.0, 1.0)
             color = color / covered
-            if made.display.bends:  # on the shoulder a small error is many times as large in linear light
+            if composite.display.bends:  # on the shoulder a small error is many times as large in linear light
                 color = color.clamp_max(filling.most)
-            fill[at] = left[:, None] * covered * to_linear(color, made.display)
-            share[at] += left * filling.share
-            source[at] = torch.where(left > 0.5, filling.source, float(made.primary))
+            fill[at] = remaining[:, None] * covered * to_linear(color, composite.display)
+            share[at] += remaining * filling.share
+            source[at] = torch.where(remaining > 0.5, filling.source, float(composite.primary))
         torch.maximum(alpha, matte, out=alpha)
         source[share <= 0.0] = 0.0
-        made.plate[rows], made.source[rows] = share, source
-        made.linear[rows] = fill if lead is None else torch.addcmul(fill, matte[..., None], lead)
+        composite.plate[rows], composite.source[rows] = share, source
+        composite.linear[rows] = fill if lead is None else torch.addcmul(fill, matte[..., None], lead)
 
 
 def _terms(target: TargetView, fillers: Fillers | None) -> dict[str, Tensor]:
@@ -249,5 +251,5 @@ def _terms(target: TargetView, fillers: Fillers | None) -> dict[str, Tensor]:
     terms = {name: getattr(target, name) for name in ("motion", "doubt", "moved", "unseen")}
     if fillers is not None:
         for n, frame in enumerate(fillers.chosen):
-            terms |= {f"shown.{frame}": fillers.shown[n], f"agreed.{frame}": fillers.agreed[n]}
+            terms |= {f"shown.{frame}": fillers.visible[n], f"agreed.{frame}": fillers.agreed[n]}
     return terms

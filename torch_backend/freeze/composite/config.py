@@ -28,7 +28,7 @@ class CompositeConfig:
     """Weight of a plate of another time on movers that the model explains. A depth error of one pixel misplaces plate
     t* in views far away in pose. The residual of the frame's own plate is in place, but of another time. Using both is
     better than either alone."""
-    beside: float = 20.0
+    max_mover_angle: float = 20.0
     """Angle in degrees between the frame's and plate t*'s viewing rays of a mover, above which plate t*'s own pixels
     are not used. Their weight is full up to half of this angle."""
     state: StateConfig = field(default_factory=StateConfig)

@@ -15,7 +15,7 @@ from ..views.target_view import TargetView, displacements, parallax
 from ..views.visibility import Visibility
 from .config import CompositeConfig
 
-WHOLE = 1.0 - 0.5 / 1024.0
+FULL_MATTE = 1.0 - 0.5 / 1024.0
 """Matte above which rounding to 1024 steps gives 1, so that the pixel comes from the primary plate alone."""
 _ROUGH = 1
 """Radius, in pixels at decision resolution, of the surroundings that a plate must also show to fill a pixel near a
@@ -30,7 +30,7 @@ class Fillers:
     """Frame numbers of the plates."""
     moved: list[Tensor]
     """[h, w, 3] scene flow of the visible surface from t* to the plate, scene units, at decision resolution."""
-    shown: list[Tensor]
+    visible: list[Tensor]
     """[h, w] in 0..1: the plate shows the surface and its surroundings."""
     agreed: list[Tensor]
     """[h, w] in 0..1: the plate and plate t* show the surface alike."""
@@ -67,18 +67,20 @@ def fillers_of(
     usable: list[int],
 ) -> Fillers | None:
     """The plates that fill the pixels not covered by the primary plate; None if it covers all pixels."""
-    if not bool((matte < WHOLE).any()):
+    if not bool((matte < FULL_MATTE).any()):
         return None
     chosen = _chosen(source_views, config, target, matte, primary, usable)
     moved = displacements(source_views, target, chosen)
-    shown = _shown(source_views, target, chosen, moved)
+    visible = _visible_surroundings(source_views, target, chosen, moved)
     agreed = _agreed(source_views, config, target, chosen, moved)
     residuals = [source_views.residual(frame) for frame in chosen]
     most = max(source_views.scene.display.most, *(source_views.most(frame) for frame in chosen))
-    return Fillers(chosen, moved, shown, agreed, residuals, most)
+    return Fillers(chosen, moved, visible, agreed, residuals, most)
 
 
-def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
+def _visible_surroundings(
+    source_views: SourceViews, target: TargetView, chosen: list[int], moved: list[Tensor]
+) -> list[Tensor]:
     """[h, w] in 0..1 per plate: visibility of the pixel's surface and its surroundings. Only used near movers."""
     near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 4 * _ROUGH + 1)  # radius of the erosion and blur below
     points, out = target.points[near], list[Tensor]()
@@ -103,17 +105,17 @@ def _agreed(
         return [torch.ones_like(target.depth) for _ in chosen]
     points = target.points[::2, ::2]  # a quarter of the work: it is low-passed
     truth = source_views.seen(target.t, points)
-    shown_at_t = look_up(source_views.view(target.t).picture.float(), truth.pixels)
+    instant_color = look_up(source_views.view(target.t).picture.float(), truth.pixels)
     out: list[Tensor] = []
     for frame, way in zip(chosen, moved, strict=True):
         if frame == target.t:
             out.append(torch.ones_like(target.depth))
             continue
         visibility = source_views.seen(frame, points + way[::2, ::2])
-        says = look_up(source_views.view(frame).picture.float(), visibility.pixels)
+        plate_color = look_up(source_views.view(frame).picture.float(), visibility.pixels)
         both = (truth.visible * visibility.visible)[..., None]
-        off = source_views.difference(says * both, shown_at_t * both)
-        out.append(resized(torch.exp(-0.5 * (off / config.state.noise).square()), w, h))
+        difference = source_views.difference(plate_color * both, instant_color * both)
+        out.append(resized(torch.exp(-0.5 * (difference / config.state.noise).square()), w, h))
     return out
 
 
@@ -121,7 +123,7 @@ def fill(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, fillers: Fillers, matte: Tensor, rows: slice
 ) -> Filling:
     """Fills the pixels of some rows that the primary plate does not cover: splats plus weighted residuals of plates."""
-    at = (matte[rows] < WHOLE).nonzero()
+    at = (matte[rows] < FULL_MATTE).nonzero()
     y, x = at[:, 0], at[:, 1]
     count = len(at)
     share, source = (torch.zeros(count, device="cpu") for _ in range(2))
@@ -149,7 +151,7 @@ def fill(
         else:
             visibility = source_views.seen(frame, points + look_up(fillers.moved[n], small))
         visibility = _doubted(visibility, doubt)
-        around = torch.minimum(visibility.visible, look_up(fillers.shown[n], small))
+        around = torch.minimum(visibility.visible, look_up(fillers.visible[n], small))
         visibility.visible = torch.lerp(visibility.visible, around, uneasy)
         agreed = look_up(fillers.agreed[n], small)
         unmoved = _unmoved(source_views, config, frame, points, visibility) * agreed
@@ -169,7 +171,7 @@ def fill(
     if truth is not None:
         at = fillers.chosen.index(target.t)
         # A plate near in pose that shows nearly the same state has no reprojection error; plate t* may be a pixel off.
-        around = truth.visible * look_up(fillers.shown[at], small) * (1.0 - same_state)
+        around = truth.visible * look_up(fillers.visible[at], small) * (1.0 - same_state)
         _take_instant(source_views, config, target, filling, points, small, around, places[at])
     filling.most = fillers.most
     return filling
@@ -195,8 +197,8 @@ def _take_instant(
     weight = visible * _facing(source_views, config, target, points) * moves
     used = weight > 0.0
     gain, offset = _exposed(source_views, target, target.t)
-    shown = look_up_near(source_views.displayed(target.t), places[used]) * gain + offset
-    filling.color[used] = torch.lerp(filling.color[used], shown, weight[used][:, None])
+    instant_color = look_up_near(source_views.displayed(target.t), places[used]) * gain + offset
+    filling.color[used] = torch.lerp(filling.color[used], instant_color, weight[used][:, None])
     filling.share = torch.lerp(filling.share, torch.ones_like(weight), weight)
     filling.source = torch.where(weight > 0.5, float(target.t), filling.source)
 
@@ -206,7 +208,7 @@ def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetVi
     a, b = points - source_views.centres[source_views.index[target.t]], points - target.centre
     cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
     angle = torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
-    return (2.0 - 2.0 * angle / config.beside).clamp(0.0, 1.0)
+    return (2.0 - 2.0 * angle / config.max_mover_angle).clamp(0.0, 1.0)
 
 
 def _exposed(source_views: SourceViews, target: TargetView, frame: int) -> tuple[Tensor, Tensor]:
@@ -294,11 +296,13 @@ def _chosen(
         have = have + gains[frame]
     while len(chosen) < min(config.sources, len(gains)):
         # Square root: a second plate of the same wall helps less than a first plate of another wall.
-        left = {frame: gain for frame, gain in gains.items() if frame not in chosen}
-        worth = {frame: float(((have + gain).sqrt() - have.sqrt()).sum()) for frame, gain in left.items()}
-        candidates = sorted(worth, key=lambda candidate: abs(candidate - primary))
-        frame = candidates[int(first_best(torch.tensor([worth[each] for each in candidates], device="cpu")))]
-        if worth[frame] <= 0.0:
+        remaining = {frame: gain for frame, gain in gains.items() if frame not in chosen}
+        benefit = {frame: float(((have + gain).sqrt() - have.sqrt()).sum()) for frame, gain in remaining.items()}
+        candidates = sorted(benefit, key=lambda candidate: abs(candidate - primary))
+        frame = candidates[
+            int(first_best(torch.tensor([benefit[candidate] for candidate in candidates], device="cpu")))
+        ]
+        if benefit[frame] <= 0.0:
             break
         chosen.append(frame)
         have = have + gains[frame]

@@ -35,7 +35,7 @@ _FEWEST = 12
 """Number of flat blocks below which a level or a channel is not trusted."""
 _LEAST = 0.05
 """Share of a level's blocks, those with the lowest variance, that start the search for flat blocks."""
-_STANDS_OUT = 3.0
+_OUTLIER = 3.0
 """Outlier threshold. A block's variance may exceed the mean by this many standard deviations, and a level's deviation
 may be this many times the median of all levels. Beyond that, the picture's texture is taken to be the cause."""
 _MOST = 0.08
@@ -106,7 +106,7 @@ def measure(frames: Sequence[NDArray[Any]]) -> Grain:
                 deviation[c, k] = np.sqrt(
                     max(0.0, (np.median(chosen) / _median_ratio(softness) - step**2 / 12.0) / share)
                 )
-    curve = _whole_curve(deviation)
+    curve = _filled_curve(deviation)
     return (
         Grain(curve, softness, _agreement(residual, flat[:, 0] & flat[:, 1] & flat[:, 2]))
         if curve.any()
@@ -216,9 +216,9 @@ def _blocks(frame: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float3
     values /= 255.0 if frame.dtype == np.uint8 else 65535.0
     blocks = values.reshape(rows, _BLOCK, columns, _BLOCK, 3).transpose(0, 2, 4, 1, 3).reshape(-1, 3, _BLOCK**2)
     basis = _basis().astype(np.float32)
-    whole = np.asarray(((blocks > 0.0) & (blocks < 1.0)).all(axis=2), np.bool_)
+    is_unclipped = np.asarray(((blocks > 0.0) & (blocks < 1.0)).all(axis=2), np.bool_)
     residual = np.asarray(blocks - (blocks @ basis) @ basis.T, np.float32)
-    return residual, blocks.mean(axis=2), whole
+    return residual, blocks.mean(axis=2), is_unclipped
 
 
 @functools.lru_cache(maxsize=64)
@@ -259,7 +259,7 @@ def _only_grain(variance: NDArray[Any], softness: float) -> NDArray[np.bool_]:
     """bool [n]: blocks of one level whose variance [n] grain alone explains, grown from those of lowest variance."""
     if len(variance) < _FEWEST:
         return np.zeros(len(variance), bool)
-    most = 1.0 + _STANDS_OUT * np.sqrt(2.0 / _kept(softness)[1])  # relative to the mean, approximated by the median
+    most = 1.0 + _OUTLIER * np.sqrt(2.0 / _kept(softness)[1])  # relative to the mean, approximated by the median
     chosen = variance <= np.quantile(variance, _LEAST)
     while True:
         more = variance <= most * float(np.median(variance[chosen]))
@@ -275,23 +275,23 @@ def _softness(residual: NDArray[np.float32], flat: NDArray[np.bool_]) -> float:
     if len(chosen) < _FEWEST:
         return 0.0
     power = np.mean(chosen**2, axis=(1, 2))
-    like = power < _STANDS_OUT**2 * np.median(power)  # rejects levels without flat blocks
+    like = power < _OUTLIER**2 * np.median(power)  # rejects levels without flat blocks
     chosen, power = chosen[like], power[like]
     seen: list[float] = []
     for dy, dx in _LAGS:
-        one, other = chosen[:, : _BLOCK - dy, : _BLOCK - dx], chosen[:, dy:, dx:]
-        seen.append(float(np.median(np.mean(one * other, axis=(1, 2)) / power)))
+        block, shifted = chosen[:, : _BLOCK - dy, : _BLOCK - dx], chosen[:, dy:, dx:]
+        seen.append(float(np.median(np.mean(block * shifted, axis=(1, 2)) / power)))
     errors = [np.abs(np.array(_kept(float(s))[2]) - seen).sum() for s in _SOFTNESS]
     return float(_SOFTNESS[int(np.argmin(errors))])
 
 
-def _whole_curve(deviation: NDArray[Any]) -> NDArray[np.float32]:
+def _filled_curve(deviation: NDArray[Any]) -> NDArray[np.float32]:
     """[3, BINS] deviation with NaN (too few blocks) interpolated and outlier levels replaced.
 
     A level at which the clip shows no flat surface is measured too high; grain varies smoothly with brightness.
     """
     typical = np.nanmedian(deviation) if not np.isnan(deviation).all() else 0.0
-    known = deviation <= min(_MOST, _STANDS_OUT * typical)
+    known = deviation <= min(_MOST, _OUTLIER * typical)
     curve = np.zeros_like(deviation)
     for c in range(3):
         if known[c].any():

@@ -50,13 +50,18 @@ class InstantDepth:
             moving: bool [h, w], True where the splats move; elsewhere the factor is 1.
         """
         rays, inverse = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
-        shown, _ = seen_in(self.splats, view, rays, inverse)
+        splat_inverse, _ = seen_in(self.splats, view, rays, inverse)
         found, sigma = seen_in(self.measured, view, rays, inverse)
-        own = np.maximum(sigma / np.maximum(found, LEAST_INVERSE), 1e-4)
-        near = SAME * np.sqrt(np.square(own) + self.splat_noise**2)
-        known = moving & (sigma > 0) & (own < _UNKNOWN) & (np.abs(shown / inverse - 1.0) < SAME * self.noise)
+        relative_sigma = np.maximum(sigma / np.maximum(found, LEAST_INVERSE), 1e-4)
+        near = SAME * np.sqrt(np.square(relative_sigma) + self.splat_noise**2)
+        known = (
+            moving
+            & (sigma > 0)
+            & (relative_sigma < _UNKNOWN)
+            & (np.abs(splat_inverse / inverse - 1.0) < SAME * self.noise)
+        )
         known &= np.abs(found / inverse - 1.0) < near
-        weight, prior = 1.0 / np.square(own), 1.0 / self.splat_noise**2
+        weight, prior = 1.0 / np.square(relative_sigma), 1.0 / self.splat_noise**2
         factor = 1.0 + weight / (weight + prior) * (found / inverse - 1.0)
         count, total = (
             cv2.blur(part.astype(np.float32), (_AROUND, _AROUND), borderType=cv2.BORDER_CONSTANT)
@@ -100,9 +105,9 @@ class MeasuredDepths:
         moving = has_depth & (image.motion.numpy() > 0.5)
         if not moving.any():
             return None
-        own = float(np.median(sigma[moving] / inverse[moving]))
-        apart = TO_SIGMA * float(np.median(np.abs(inverse[moving] / splats[moving] - 1.0)))
-        splat_noise = float(np.sqrt(max(apart**2 - own**2, self.config.noise**2)))
+        map_noise = float(np.median(sigma[moving] / inverse[moving]))
+        spread = TO_SIGMA * float(np.median(np.abs(inverse[moving] / splats[moving] - 1.0)))
+        splat_noise = float(np.sqrt(max(spread**2 - map_noise**2, self.config.noise**2)))
         pose = scene.viewmats[i].double().numpy(), K.double().numpy()
         # Holes of the map get the splats' depth with a standard deviation above `_UNKNOWN`.
         measured = np.where(has_depth, inverse, splats), np.where(has_depth, sigma, 10.0 * splats)

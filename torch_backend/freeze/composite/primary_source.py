@@ -40,7 +40,7 @@ def primary_plate(source_views: SourceViews, output: OutputFrame, target: Target
     The pose distance is the camera's distance divided by the depth, plus the difference in viewing direction. Of equal
     poses (a tripod) the nearest in frame number is chosen.
     """
-    if target.own and output.frame in usable:
+    if target.is_clip_view and output.frame in usable:
         return output.frame
     usable = sorted(usable, key=lambda frame: abs(frame - output.frame))
     at = torch.tensor([source_views.index[frame] for frame in usable], device="cpu")
@@ -48,7 +48,7 @@ def primary_plate(source_views: SourceViews, output: OutputFrame, target: Target
     depth = float(solid.median()) if len(solid) else 1.0
     travel = norm(source_views.centres[at] - target.centre, 1) / max(depth, 1e-6)
     turned = 1.0 - source_views.scene.viewmats[at][:, 2, :3] @ target.viewmat[2, :3]
-    return usable[first_least([float(each) for each in travel + turned], 1e-5)]
+    return usable[first_least([float(value) for value in travel + turned], 1e-5)]
 
 
 def primary_matte(
@@ -64,43 +64,45 @@ def primary_matte(
 
     `motion` comes from the mattes of plate t* where it shows the point, and from the model's matte elsewhere. `doubt`
     is 1 where the primary plate is rejected: other plates may be wrong there, too, even if their mattes are still. The
-    other two are `moved` and `unseen`.
+    other two are `moved` and `out_of_view`.
     """
     rows, columns = target.image.alpha.shape
     lead = source_views.seen(primary, target.points)
-    own = target.own
+    is_clip_view = target.is_clip_view
     truth = source_views.seen(target.t, target.points) if target.t in usable else None
-    hidden = torch.minimum(target.motion, lead.moving) if own else target.motion
+    hidden = torch.minimum(target.motion, lead.moving) if is_clip_view else target.motion
     if truth is not None:
         target.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
     else:
-        target.motion = torch.maximum(target.motion, lead.moving) if own else target.motion
+        target.motion = torch.maximum(target.motion, lead.moving) if is_clip_view else target.motion
     target.moved = target.motion
-    target.unseen = _unseen(source_views, target, torch.maximum(target.motion, lead.visible * lead.moving), usable)
-    st, within = _places(source_views, target, primary, own, size)
-    if own and primary != output.frame:  # its own plate is withheld
-        return PrimaryMatte(torch.zeros(rows, columns, device="cpu"), st, own)
-    free = _free(source_views, target, primary) if own else None
-    if own and primary == output.t_star:  # its own plate shows the instant itself
+    target.out_of_view = _out_of_view(
+        source_views, target, torch.maximum(target.motion, lead.visible * lead.moving), usable
+    )
+    st, within = _places(source_views, target, primary, is_clip_view, size)
+    if is_clip_view and primary != output.frame:  # its own plate is withheld
+        return PrimaryMatte(torch.zeros(rows, columns, device="cpu"), st, is_clip_view)
+    free = _free(source_views, target, primary) if is_clip_view else None
+    if is_clip_view and primary == output.t_star:  # its own plate shows the instant itself
         if free is not None:
             target.moved = torch.maximum(target.motion, 1.0 - free)
             within = within * resized(free, columns, rows)
-        return PrimaryMatte(within, st, own)
+        return PrimaryMatte(within, st, is_clip_view)
     of = evidence(source_views, target, primary, lead, truth, config.state)
     odds = log_odds(of, config.state, source_views.unit)
     target.doubt = let_go(odds, config.state)
     matte = 1.0 - target.doubt
-    if own:
+    if is_clip_view:
         if free is not None:
             matte = matte * free
         target.moved = torch.maximum(target.motion, 1.0 - matte)
     else:
         error = parallax(source_views, target, primary, target.depth, config.depth_error)
         matte = matte * lead.visible * torch.exp(-error.square())
-    return PrimaryMatte(resized(matte, columns, rows) * within, st, own, {**of, "log_odds": odds})
+    return PrimaryMatte(resized(matte, columns, rows) * within, st, is_clip_view, {**of, "log_odds": odds})
 
 
-def _unseen(source_views: SourceViews, target: TargetView, moving: Tensor, usable: list[int]) -> Tensor:
+def _out_of_view(source_views: SourceViews, target: TargetView, moving: Tensor, usable: list[int]) -> Tensor:
     """[h, w] in 0..1: share of moving surfaces (`moving`) that no plate near t* shows.
 
     Plates further from t* count less. The support of the Gaussians cannot be used: movers that were never
@@ -134,26 +136,26 @@ def _free(source_views: SourceViews, target: TargetView, frame: int) -> Tensor |
 
 
 def _places(
-    source_views: SourceViews, target: TargetView, primary: int, own: bool, size: tuple[int, int]
+    source_views: SourceViews, target: TargetView, primary: int, is_clip_view: bool, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
     """(ST [H, W, 2] into the primary plate, [H, W] 1 inside the plate and 0 outside).
 
-    ST is the identity if `own`, that is, on the clip's own poses.
+    ST is the identity if `is_clip_view`, that is, on the clip's own poses.
     """
     rows, columns = target.image.alpha.shape
-    if own:
+    if is_clip_view:
         x = (torch.arange(columns, device="cpu") + 0.5 - (columns - size[0]) // 2) / size[0]
         y = (torch.arange(rows, device="cpu") + 0.5 - (rows - size[1]) // 2) / size[1]
         share = torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1)
     else:
         viewmat, K = source_views.camera(primary, source_views.plates.width, source_views.plates.height)
-        whole = torch.tensor([source_views.plates.width, source_views.plates.height], device="cpu")
+        plate_size = torch.tensor([source_views.plates.width, source_views.plates.height], device="cpu")
         share = torch.empty(rows, columns, 2, device="cpu")
         for band in bands(rows, columns):
             pixels = pixel_centres(columns, band.stop - band.start)
             pixels[..., 1] += band.start
             points = unproject(pixels, target.image.depth[band], target.viewmat, target.K)
-            share[band] = project(points, viewmat, K)[0] / whole
+            share[band] = project(points, viewmat, K)[0] / plate_size
     within = ((share > 0.0) & (share < 1.0)).all(dim=-1).float()
     share[..., 1] = 1.0 - share[..., 1]
     return snap(share.clamp_(-4.0, 5.0), (source_views.plates.width, source_views.plates.height)), within

@@ -89,7 +89,7 @@ def evidence(
     if instant is not None:
         noise += _unexplained(source_views, target.t, instant, config.smoothing * unit)
         carried = look_up(source_views.view(target.t).picture.float(), instant.pixels)
-        ours, theirs = (blurred(each * instant.visible[..., None], unit) for each in (plate, carried))
+        ours, theirs = (blurred(colors * instant.visible[..., None], unit) for colors in (plate, carried))
         reach = max(1, round(MARGIN * unit))  # pixels by which a depth error may misplace plate t*
         contradiction = torch.maximum(beyond(ours, theirs, reach), beyond(theirs, ours, reach))
     gain = change - misfit

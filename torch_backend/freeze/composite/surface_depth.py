@@ -122,11 +122,11 @@ class StillSurfaces:
         """The key views whose cameras are nearest to a camera (world-to-camera [4, 4]), nearest first."""
         centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
 
-        def away(key: KeyView) -> float:
-            off = float(np.linalg.norm(-key.viewmat[:3, :3].T @ key.viewmat[:3, 3] - centre))
-            return off + float(np.linalg.norm(key.viewmat[2, :3] - viewmat[2, :3]))
+        def distance(key: KeyView) -> float:
+            offset = float(np.linalg.norm(-key.viewmat[:3, :3].T @ key.viewmat[:3, 3] - centre))
+            return offset + float(np.linalg.norm(key.viewmat[2, :3] - viewmat[2, :3]))
 
-        return sorted(self.keys, key=away)[: self.config.around]
+        return sorted(self.keys, key=distance)[: self.config.around]
 
 
 def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
@@ -137,13 +137,13 @@ def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
     return np.asarray(grey - cv2.GaussianBlur(grey, (0, 0), config.detail), np.float32)
 
 
-def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig) -> tuple[Array, Array]:
+def refined(key: KeyView, neighbours: Sequence[KeyView], config: SurfaceDepthConfig) -> tuple[Array, Array]:
     """(inverse depth [h, w] of a key view at which plates agree, its standard deviation [h, w])."""
     start, inverse = key.inverse, key.inverse.copy()
     prior = 1.0 / np.square(start)  # relative error of 100 %: splats only count where plates have no texture
     variance = 1.0 / prior
-    for _ in range(config.steps if others else 1):
-        information, pull, parallax = gauss_newton(key, others, inverse, config)
+    for _ in range(config.steps if neighbours else 1):
+        information, pull, parallax = gauss_newton(key, neighbours, inverse, config)
         weight = information + prior
         step = (pull + prior * (start - inverse)) / weight
         pixel = 1.0 / np.maximum(parallax, 1e-3)  # a step of one pixel: the linearisation holds no further
@@ -153,21 +153,23 @@ def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig)
 
 
 def gauss_newton(
-    key: KeyView, others: Sequence[KeyView], inverse: Array, config: SurfaceDepthConfig
+    key: KeyView, neighbours: Sequence[KeyView], inverse: Array, config: SurfaceDepthConfig
 ) -> tuple[Array, Array, Array]:
-    """(information, pull, parallax) of a key view's inverse depth from the plates of `others`, [h, w] each.
+    """(information, pull, parallax) of a key view's inverse depth from the plates of `neighbours`, [h, w] each.
 
     Information is 1 / variance. Pull is information times the Gauss-Newton step. Parallax is the largest image motion
     in any of the plates, in pixels per unit of inverse depth.
     """
     information, pull, parallax = np.zeros_like(inverse), np.zeros_like(inverse), np.zeros_like(inverse)
     rays = rays_of(key.K, inverse.shape)
-    for other in others:
-        place = Place.of(key, other, rays, inverse)
-        shift = place.look(other.picture) - key.picture
-        slope = place.look(_slope(other.picture, 1)) * place.dx + place.look(_slope(other.picture, 0)) * place.dy
-        clear = place.look(other.inverse) < (1.0 + SAME * config.noise) * place.inverse
-        weight = place.look(other.still) * key.still * clear
+    for neighbour in neighbours:
+        place = Place.of(key, neighbour, rays, inverse)
+        shift = place.look(neighbour.picture) - key.picture
+        slope = (
+            place.look(_slope(neighbour.picture, 1)) * place.dx + place.look(_slope(neighbour.picture, 0)) * place.dy
+        )
+        clear = place.look(neighbour.inverse) < (1.0 + SAME * config.noise) * place.inverse
+        weight = place.look(neighbour.still) * key.still * clear
         seen = weight > 0.5
         if not seen.any():
             continue
@@ -200,13 +202,13 @@ class Place:
     """[h, w] inverse depth in the other view; 0 behind its camera."""
 
     @classmethod
-    def of(cls, view: KeyView, other: KeyView, rays: Array, inverse: Array) -> Place:
+    def of(cls, view: KeyView, target: KeyView, rays: Array, inverse: Array) -> Place:
         """Projection of the points of `view` at inverse depth `inverse` [h, w] along `rays` [h, w, 3]."""
-        turn, shift = between(view.viewmat, other.viewmat)
+        turn, shift = between(view.viewmat, target.viewmat)
         points = rays @ turn.T + inverse[..., None] * shift
         in_front = points[..., 2] > 1e-3
         depth = np.where(in_front, points[..., 2], 1.0)
-        fx, fy, cx, cy = (float(other.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        fx, fy, cx, cy = (float(target.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
         x, y = points[..., 0] / depth, points[..., 1] / depth
         dx, dy = (f * (shift[i] - at * shift[2]) / depth for i, f, at in ((0, fx, x), (1, fy, y)))
         outside = np.where(in_front, 0.0, -1e6).astype(np.float32)
@@ -220,10 +222,10 @@ class Place:
         return cv2.remap(picture, self.x, self.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
 
-def between(view: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[Array, Array]:
+def between(view: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[Array, Array]:
     """(rotation [3, 3], translation [3]) from one world-to-camera [4, 4] to another."""
-    turn = other[:3, :3] @ view[:3, :3].T
-    return turn.astype(np.float32), (other[:3, 3] - turn @ view[:3, 3]).astype(np.float32)
+    turn = target[:3, :3] @ view[:3, :3].T
+    return turn.astype(np.float32), (target[:3, 3] - turn @ view[:3, 3]).astype(np.float32)
 
 
 def rays_of(K: NDArray[np.float64], size: tuple[int, ...]) -> Array:
@@ -282,23 +284,23 @@ def frame_depth(
     K[0] *= w / width
     K[1] *= h / height
     still, mover = np.clip(1.0 - 2.0 * moving, 0.0, 1.0), moving > 0.5
-    whole, noise = splats.inverse, np.full_like(inverse, config.noise)
+    full_inverse, noise = splats.inverse, np.full_like(inverse, config.noise)
     if measured is not None:
         factor, noise = measured.correction(KeyView(splats.viewmat, K, inverse, still, inverse, inverse), mover)
         inverse = np.asarray(inverse * factor, np.float32)
         factor = np.asarray(cv2.resize(factor, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-        whole = np.where(splats.moving > 0.5, whole * factor, whole)
+        full_inverse = np.where(splats.moving > 0.5, full_inverse * factor, full_inverse)
     sigma = noise * np.maximum(inverse, LEAST_INVERSE)
     inverse, _ = smoothed(inverse, 1.0 / np.square(sigma), (config.small,), config.uneven)  # single splats stick out
     values, sigma = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, sigma))
     # Movers and static surfaces are fitted separately, so that planes never span both.
     weight = 1.0 / np.square(np.maximum(sigma, LEAST_INVERSE * config.noise))
     still, moved = (fit_planes(values, weight * (of + 1e-9), config.radii[0]) for of in (~mover, mover))
-    planes = Planes(*(np.where(mover, *each) for each in zip(moved, still, strict=True)))
+    planes = Planes(*(np.where(mover, *pair) for pair in zip(moved, still, strict=True)))
     guide = np.concatenate([picture, (4.0 * config.color * (splats.moving > 0.5))[..., None]], axis=2, dtype=np.float32)
     small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
     small = np.concatenate([small, (4.0 * config.color * mover)[..., None]], axis=2, dtype=np.float32)
-    return selected(planes, sigma, small, whole, guide, config)
+    return selected(planes, sigma, small, full_inverse, guide, config)
 
 
 def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
@@ -308,16 +310,18 @@ def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
     """
     rays, splats = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
     seen = [(splats, view.sigma), *(seen_in(key, view, rays, splats) for key in surfaces.near(view.viewmat))]
-    values, sigmas = (np.stack(each) for each in zip(*seen, strict=True))
+    values, sigmas = (np.stack(rows) for rows in zip(*seen, strict=True))
     votes = (sigmas > 0).astype(np.float32)
     votes[1:] *= (view.still > 0) / max(len(values) - 1, 1)  # key views share plates: together they have one vote
     all_votes = np.maximum(votes.sum(0), 1e-12)
     variances = np.square(np.maximum(sigmas, 1e-4 * splats))
     densities, means, spreads = (np.zeros_like(values) for _ in range(3))
     for i, (value, variance) in enumerate(zip(values, variances, strict=True)):
-        off = np.square(values - value)
-        densities[i] = (votes[i] > 0) * (votes * np.exp(-0.5 * off / variances) / np.sqrt(variances)).sum(0)
-        agree = votes * np.exp(-0.5 * off / (variances + variance))
+        squared_difference = np.square(values - value)
+        densities[i] = (votes[i] > 0) * (
+            votes * np.exp(-0.5 * squared_difference / variances) / np.sqrt(variances)
+        ).sum(0)
+        agree = votes * np.exp(-0.5 * squared_difference / (variances + variance))
         weight = agree / variances
         total = np.maximum(weight.sum(0), 1e-12)
         means[i] = (weight * values).sum(0) / total
@@ -342,14 +346,14 @@ def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[A
     turn, shift = between(view.viewmat, key.viewmat)
     along_axis = (rays @ turn.T)[..., 2]
 
-    def once(inverse: Array) -> tuple[Array, Array]:
+    def refine(inverse: Array) -> tuple[Array, Array]:
         place = Place.of(view, key, rays, inverse)
         depth = place.look(key.inverse)
         better = depth * along_axis / np.maximum(1.0 - depth * shift[2], 1e-3)
         better = np.maximum(np.where(depth > 0, better, inverse), LEAST_INVERSE).astype(np.float32)
         return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, LEAST_INVERSE), 0.0)
 
-    return once(once(inverse)[0])
+    return refine(refine(inverse)[0])
 
 
 def selected(
@@ -414,8 +418,8 @@ class FrameDepths:
         has_depth = depth < NO_DEPTH
         inverse = torch.where(has_depth, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE), 0.0)
         splats = Splats(viewmat.double().numpy(), K.double().numpy(), inverse.numpy(), motion.numpy())
-        shown = picture.clamp(0.0, 1.0).numpy()
-        found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, shown, measured))
+        clipped = picture.clamp(0.0, 1.0).numpy()
+        found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, clipped, measured))
         refined = torch.where(has_depth, 1.0 / found.clamp_min(LEAST_INVERSE), NO_DEPTH)
         return refined, torch.where(has_depth, sigma * refined.square(), 0.0)
 

@@ -10,12 +10,12 @@ from ...footage.color import LINEAR_KNEE, SRGB_KNEE
 from ...footage.display import Display
 
 
-def to_linear(shown: Tensor, display: Display) -> Tensor:
+def to_linear(values: Tensor, display: Display) -> Tensor:
     """Scene-linear light from display values of any shape, like `Display.to_light`."""
-    encoded = shown
+    encoded = values
     if display.bends:
-        above = (shown - SHOULDER_FROM).clamp_min(0.0)
-        encoded = shown.clamp_max(SHOULDER_FROM) + SHOULDER_ROLL * torch.expm1(above / SHOULDER_ROLL)
+        above = (values - SHOULDER_FROM).clamp_min(0.0)
+        encoded = values.clamp_max(SHOULDER_FROM) + SHOULDER_ROLL * torch.expm1(above / SHOULDER_ROLL)
     size = encoded.abs()
     curve = ((size.clamp_min(float(SRGB_KNEE)) + 0.055) / 1.055).pow(2.4)
     return torch.where(size <= float(SRGB_KNEE), encoded / 12.92, torch.copysign(curve, encoded))

@@ -36,11 +36,11 @@ from ..frozen import FrozenGaussians
 from ..views.scene_flow import SceneFlow
 from ..views.source_views import LENGTHS_OF, MovingOf
 from ..views.working_plates import WorkingPlates, showing, spread
-from .undersampled import AFAR, undersampled
+from .undersampled import UNDERSAMPLED_RATIO, undersampled
 
 _TRAINING = TrainConfig()
 """Loss, weights and learning rates of a training of 3000 steps, from which those of an instant are derived."""
-_BESIDE = 2
+_NEIGHBOURS = 2
 """Number of trained frames on either side of t* that judge movers trained alone."""
 _PARTS = (0.0, 0.5, 1.0)
 """Blend factors between movers before and after fine-tuning; the best of them is kept."""
@@ -69,7 +69,7 @@ class DevelopConfig:
     instant_share: float = 0.25
     """Share of the steps on plate t* itself, or on its neighbours if it was held out of training. It gives 30 steps to
     plate t*, which alone shows the movers at t*."""
-    afar: float = AFAR
+    afar: float = UNDERSAMPLED_RATIO
     """Ratio of distances above which plate t* does not train a Gaussian, as in `undersampled`."""
     seed: int = 0
     """Seed of the order of frames."""
@@ -119,14 +119,14 @@ class _FineTuning:
         self.optimizer = self._optimizer()
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
         known = len(run.model.gaussians)
-        self.afar = torch.zeros_like(self.mover)
-        self.afar[:known] = undersampled(run, scene, frozen.state["means"][:known], t_star, config.afar).float()
+        self.undersampled = torch.zeros_like(self.mover)
+        self.undersampled[:known] = undersampled(run, scene, frozen.state["means"][:known], t_star, config.afar).float()
         # An undersampled Gaussian that moves in other frames is not trained, because they show it at other times.
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in self.probes or self.instants])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
         opened[known:] = 1.0
-        self.held = ((self.afar > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
-        self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
+        self.fixed_rows = ((self.undersampled > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
+        self.mover_rows = (self.mover * opened > 0.5).nonzero()[:, 0]
         """Rows of movers that lie on moving pixels of plate t*."""
 
     def run(self, check: Check | None) -> FrozenGaussians:
@@ -141,7 +141,7 @@ class _FineTuning:
         after = self._judged()
         state = {name: p.detach() for name, p in self.params.items()}
         if after[0] < before[0] + self.config.gain or after[1] < before[1]:
-            state = self._movers_alone(lambda _: checked(steps))
+            state = self._movers_only(lambda _: checked(steps))
         was = self.frozen
         return FrozenGaussians(state, was.sh_degree, was.support, was.motion, was)
 
@@ -161,20 +161,22 @@ class _FineTuning:
             self._step(frame)
             if n >= steps // 2:
                 mean.add(self.params)
-        mean.put_into(self.params)
+        mean.copy_into(self.params)
 
-    def _movers_alone(self, check: Callable[[int], None]) -> dict[str, Tensor]:
+    def _movers_only(self, check: Callable[[int], None]) -> dict[str, Tensor]:
         """The state before training, except for movers, which are trained on plate t* alone.
 
         Movers get the blend of `_PARTS` that gains most on plate t*, minus `worth` times the loss of frames near t*.
         """
-        was, rows, near = self.frozen.state, self.alone, self._near()
+        was, rows, neighbours = self.frozen.state, self.mover_rows, self._neighbours()
         kept = dict(was)
-        if not len(rows) or not near:
+        if not len(rows) or not neighbours:
             return kept
         self._show(was)
         self.optimizer = self._optimizer()
-        self.held = torch.ones_like(self.mover).index_fill(0, rows, 0.0).index_fill(0, self.held, 1.0).nonzero()[:, 0]
+        self.fixed_rows = (
+            torch.ones_like(self.mover).index_fill(0, rows, 0.0).index_fill(0, self.fixed_rows, 1.0).nonzero()[:, 0]
+        )
         steps = max(1, round(self.config.instant_share * self.config.steps))
         self._train(steps, 1.0, check)
         developed = {name: p.detach()[rows] for name, p in self.params.items()}
@@ -182,22 +184,22 @@ class _FineTuning:
         for n, part in enumerate(_PARTS):
             state = {k: v.index_copy(0, rows, torch.lerp(v[rows], developed[k], part)) for k, v in was.items()}
             self._show(state)
-            errors = self._error(self.instants, movers=True), self._error(near, movers=True)
+            errors = self._error(self.instants, movers=True), self._error(neighbours, movers=True)
             first = first if n else errors
-            worth = first[0] - errors[0] - self.config.worth * max(0.0, errors[1] - first[1])
-            if worth > best:
-                best, kept = worth, state
+            benefit = first[0] - errors[0] - self.config.worth * max(0.0, errors[1] - first[1])
+            if benefit > best:
+                best, kept = benefit, state
         return kept
 
     def _show(self, state: dict[str, Tensor]) -> None:
         for name, value in state.items():
             self.params[name].data = value.clone()
 
-    def _near(self) -> list[int]:
+    def _neighbours(self) -> list[int]:
         """The trained frames nearest to t* on either side, without those that show t* itself."""
         before = [frame for frame in self.trained.train_frames if frame < min(self.instants)]
         after = [frame for frame in self.trained.train_frames if frame > max(self.instants)]
-        return [*before[-_BESIDE:], *after[:_BESIDE]]
+        return [*before[-_NEIGHBOURS:], *after[:_NEIGHBOURS]]
 
     def _judged(self) -> tuple[float, float]:
         """(PSNR in dB of the still pixels of the probes, PSNR in dB of plate t* or its neighbours)."""
@@ -210,50 +212,50 @@ class _FineTuning:
         pixels. 0 without such pixels."""
         sums = torch.zeros(2, dtype=torch.float64, device=self.device)
         for frame in frames:
-            shown, pixels = self._shown(frame)
+            rendered, pixels = self._render(frame)
             if movers:
                 ignored, pixels = self.plates.ignored(frame), self.plates.matte(frame) > 0.5
                 pixels = pixels if ignored is None else pixels & ~ignored
-            error = (shown.clamp(0.0, 1.0) - self.plates.picture(frame)).square().mean(-1)[pixels]
+            error = (rendered.clamp(0.0, 1.0) - self.plates.picture(frame)).square().mean(-1)[pixels]
             sums += torch.stack([error.double().sum(), torch.tensor(float(error.numel()), device=self.device)])
         return float(sums[0] / sums[1].clamp_min(1.0))
 
     def _step(self, frame: int) -> None:
-        shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
-        target = torch.where(learnt[..., None], self.plates.picture(frame), shown.detach())
-        loss = photometric(shown, target, _TRAINING.dssim)
+        rendered, learnt = self._render(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
+        target = torch.where(learnt[..., None], self.plates.picture(frame), rendered.detach())
+        loss = photometric(rendered, target, _TRAINING.dssim)
         # Gaussians that plate t* does not train get no opacity penalty, which would only fade them.
-        shares = torch.sigmoid(self.params["opacity_logits"]) * (1.0 - self.afar)
+        shares = torch.sigmoid(self.params["opacity_logits"]) * (1.0 - self.undersampled)
         total = loss + _TRAINING.opacity_weight * shares.mean()
         self.optimizer.zero_grad(set_to_none=True)
         backward(total)
         for parameter in self.params.values():
             if parameter.grad is not None:
-                parameter.grad[self.held] = 0.0
+                parameter.grad[self.fixed_rows] = 0.0
         self.optimizer.step(guard=[total])
 
-    def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def _render(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(render [H, W, 3] of the scene moved to a frame, pixels [H, W] bool as from `_learnt`).
 
         The background colour changes at every step, so that a hole cannot pass for a grey wall.
         """
         background = torch.full((3,), 0.5, device=self.device) if background is None else background
-        marks = torch.stack([self.mover, self.afar], dim=1)
+        marks = torch.stack([self.mover, self.undersampled], dim=1)
         state = self.travel.moved(dict(self.params), frame)
         out = render(
             state, self.frozen.sh_degree, *self.plates.camera(frame),
             background=torch.cat([background, background.new_zeros(2)]), colors=marks,
             with_contributions=False,
         )  # fmt: skip
-        shown = self.trained.model.exposure.apply(out.colors[0, ..., :3], self.scene.time_of_frame(frame))
-        return shown, self._learnt(frame, *out.colors[0, ..., 3:].detach().unbind(-1))
+        rendered = self.trained.model.exposure.apply(out.colors[0, ..., :3], self.scene.time_of_frame(frame))
+        return rendered, self._learnt(frame, *out.colors[0, ..., 3:].detach().unbind(-1))
 
-    def _learnt(self, frame: int, mover: Tensor, afar: Tensor) -> Tensor:
+    def _learnt(self, frame: int, mover: Tensor, undersampled: Tensor) -> Tensor:
         """bool [H, W]: pixels of a frame that are valid training data for the frozen scene."""
         matte, ignored = self.plates.matte(frame), self.plates.ignored(frame)
         learnt = (matte < 0.5) & (mover < 0.5)
         if frame in self.instants:
-            learnt = learnt | (afar < 0.5)
+            learnt = learnt | (undersampled < 0.5)
         return learnt if ignored is None else learnt & ~ignored
 
     def _optimizer(self) -> FusedAdam:

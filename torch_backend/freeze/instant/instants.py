@@ -46,7 +46,7 @@ class Instants:
         self.config = config_for(run)
         self.keys = {t: developed_key(shot, run, int(t), self.config, query) for t in to_develop if t in trained}
         """t* -> key of the developed instants. Only frames whose plates the run was trained on are developed."""
-        self._held: dict[float, FrozenGaussians] = {}
+        self._in_memory: dict[float, FrozenGaussians] = {}
         self._at: tuple[float, FrozenGaussians] | None = None
 
     @property
@@ -54,13 +54,13 @@ class Instants:
         """Numbers of the frames that are developed, ascending."""
         return sorted(int(t) for t in self.keys)
 
-    def is_kept(self, t_star: float) -> bool:
+    def is_stored(self, t_star: float) -> bool:
         """True if the developed instant is stored in the run's folder."""
-        return t_star not in self._held and self._kept(t_star) is not None
+        return t_star not in self._in_memory and self._stored(t_star) is not None
 
     def prepare(self, t_stars: Iterable[float], report: Reporter) -> None:
         """Develops the instants of `t_stars` in `keys` that are not stored yet. `Cancelled` leaves no partial file."""
-        missing = [t for t in dict.fromkeys(t_stars) if t in self.keys and self._kept(t) is None]
+        missing = [t for t in dict.fromkeys(t_stars) if t in self.keys and self._stored(t) is None]
         for n, t_star in enumerate(missing):
             self._at = None  # frees memory for the next instant
             self._develop(t_star, report, n, len(missing))
@@ -71,19 +71,19 @@ class Instants:
             return self._at[1]
         self._at = None  # frees memory for the next instant
         if t_star in self.keys:
-            made = self._kept(t_star) or self._develop(t_star, report)
+            instant = self._stored(t_star) or self._develop(t_star, report)
         else:
-            made = self._field(t_star)
-        self._at = t_star, made
-        return made
+            instant = self._field(t_star)
+        self._at = t_star, instant
+        return instant
 
     def _field(self, t_star: float) -> FrozenGaussians:
         return freeze_at(self.run.model, self.scene.time_of_frame(t_star), span_of(self.scene, self.run), self.query)
 
-    def _kept(self, t_star: float) -> FrozenGaussians | None:
-        held = self._held.get(t_star)
-        if held is not None:
-            return held
+    def _stored(self, t_star: float) -> FrozenGaussians | None:
+        instant = self._in_memory.get(t_star)
+        if instant is not None:
+            return instant
         return load_developed(self.shot, self.run, int(t_star), self._field(t_star), self.config, self.query)
 
     def _develop(self, t_star: float, report: Reporter, n: int = 0, count: int = 1) -> FrozenGaussians:
@@ -97,25 +97,27 @@ class Instants:
                 report.progress("developing", n * steps + done, count * steps, text)
 
         frozen = self._field(t_star)
-        made = _make(self.shot, self.run, self.scene, int(t_star), frozen, self.config, check)
+        instant = _make(self.shot, self.run, self.scene, int(t_star), frozen, self.config, check)
         # Another job may have stored the same instant meanwhile. Jobs may be using that file, so it is not replaced.
-        stored = self._kept(t_star)
-        made = made if stored is None else stored
-        self._at = t_star, made
+        stored = self._stored(t_star)
+        instant = instant if stored is None else stored
+        self._at = t_star, instant
         report.progress("developing", n + 1, count, f"t* {int(t_star)}")
         if self.run.stale:
-            self._held[t_star] = made
-            return made
+            self._in_memory[t_star] = instant
+            return instant
         if stored is not None:
-            return made
+            return instant
         try:
-            _save(self.shot, self.run, int(t_star), frozen, made, self.keys[t_star])
+            _save(self.shot, self.run, int(t_star), frozen, instant, self.keys[t_star])
         except (OSError, JobError) as error:
-            self._held[t_star] = made
+            self._in_memory[t_star] = instant
             problem = error if isinstance(error, JobError) else path_error(error)
-            why = f"{error}." if problem is None else problem.message
-            report.warning(f"The developed instant is not kept: {why}", "The next freeze at this t* develops it again.")
-        return made
+            reason = f"{error}." if problem is None else problem.message
+            report.warning(
+                f"The developed instant is not kept: {reason}", "The next freeze at this t* develops it again."
+            )
+        return instant
 
 
 def config_for(run: LoadedRun) -> DevelopConfig:
@@ -135,8 +137,8 @@ def developed_key(
 def _key(
     shot: Shot, run: LoadedRun, t_star: int, config: DevelopConfig | None, query: str, stamp: str | list[Any]
 ) -> str:  # fmt: skip
-    how = dataclasses.asdict(config or config_for(run))
-    return content_key(VERSION, stamp, query, int(t_star), motion_key(shot), how)
+    settings = dataclasses.asdict(config or config_for(run))
+    return content_key(VERSION, stamp, query, int(t_star), motion_key(shot), settings)
 
 
 def developed_path(run: LoadedRun, t_star: int) -> Path:
@@ -161,7 +163,7 @@ def load_developed(
         tensors, _ = load_checkpoint(path)
     except (JobError, OSError):
         return None
-    if not _whole(tensors, frozen):
+    if not _is_valid(tensors, frozen):
         return None
     device = frozen.support.device
     closed = tensors["closed"].to(device)
@@ -174,7 +176,7 @@ def load_developed(
     return FrozenGaussians(state, frozen.sh_degree, support, motion, before, tensors["origin"].to(device))
 
 
-def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
+def _is_valid(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
     """True if names, types, shapes and values of a file's tensors are valid for the run: the file is untrusted."""
     names = [f"{part}.{name}" for part in ("base", "state") for name in PARAM_NAMES]
     closed, origin, known = tensors.get("closed"), tensors.get("origin"), len(frozen.support)
@@ -201,13 +203,13 @@ def developed(
         keep: store the instant in the run's folder. OSError or JobError if that fails.
     """
     config = config or config_for(run)
-    made = load_developed(shot, run, t_star, frozen, config)
-    if made is not None:
-        return made
-    made = _make(shot, run, scene, t_star, frozen, config)
+    instant = load_developed(shot, run, t_star, frozen, config)
+    if instant is not None:
+        return instant
+    instant = _make(shot, run, scene, t_star, frozen, config)
     if keep and not run.stale:
-        _save(shot, run, t_star, frozen, made, developed_key(shot, run, t_star, config))
-    return made
+        _save(shot, run, t_star, frozen, instant, developed_key(shot, run, t_star, config))
+    return instant
 
 
 def _make(
@@ -218,25 +220,25 @@ def _make(
 
 
 def _save(
-    shot: Shot, run: LoadedRun, t_star: int, field: FrozenGaussians, made: FrozenGaussians, key: str
+    shot: Shot, run: LoadedRun, t_star: int, field: FrozenGaussians, instant: FrozenGaussians, key: str
 ) -> None:  # fmt: skip
     """Writes a developed instant, and deletes instants of other trainings of the run.
 
     `field` is the run's scene at t* before repairs. OSError, or JobError if a link leads out of the shot.
     """
-    assert made.descent is not None and made.origin is not None
+    assert instant.descent is not None and instant.origin is not None
     path = developed_path(run, t_star)
     folder = shot.own(path.parent)
-    closed = torch.nonzero(made.descent.motion[: len(field.motion)] < field.motion).flatten()
-    tensors = {"closed": closed, "origin": made.origin}
+    closed = torch.nonzero(instant.descent.motion[: len(field.motion)] < field.motion).flatten()
+    tensors = {"closed": closed, "origin": instant.origin}
     # An unchanged instant shares tensors with its `descent`, but tensors in a safetensors file must not share memory.
-    tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
-    tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
+    tensors |= {f"state.{name}": instant.state[name].clone() for name in PARAM_NAMES}
+    tensors |= {f"base.{name}": instant.descent.state[name] for name in PARAM_NAMES}
     sweep_half_written(folder)
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)
     stamps = run.stamp, run.former_stamp
-    for other in folder.glob("*.safetensors"):
+    for file in folder.glob("*.safetensors"):
         with contextlib.suppress(OSError):  # a file that stays only takes space: its key does not match
-            if frame_number(other.stem) is not None and other != path and read_meta(other).get("run") not in stamps:
-                other.unlink()
+            if frame_number(file.stem) is not None and file != path and read_meta(file).get("run") not in stamps:
+                file.unlink()

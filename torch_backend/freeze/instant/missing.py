@@ -61,16 +61,18 @@ def with_missing(
     matte = matte if ignored is None else matte * (~ignored).float()
     unit, moves = width / LENGTHS_OF, frozen.motion > 0.5
 
-    def shown(scene: FrozenGaussians) -> FrozenImage:
+    def rendered(scene: FrozenGaussians) -> FrozenImage:
         return render_frozen(scene, viewmat, K, width, height, run.model.exposure, time)
 
     # A moving Gaussian is a floater if plate t* contradicts most of its visible contribution. It could be mistaken for
     # the surface that a hand is attached to, and the hand would be placed too near.
-    wrong = matte * mismatch(picture, shown(frozen).color, unit, config.plates)
+    wrong = matte * mismatch(picture, rendered(frozen).color, unit, config.plates)
     weights = torch.stack([wrong, torch.ones_like(wrong)], dim=-1).to(moves.device)
-    inside, whole = gathered(frozen.state, viewmat.to(moves.device), K.to(moves.device), width, height, weights).T
-    frozen = _hiding(frozen, moves & (whole > SEEN) & (inside > 0.5 * whole))
-    missing, inverse = missing_pixels(picture, shown(frozen), shown(_hiding(frozen, moves)), matte, unit, config.plates)
+    inside, total = gathered(frozen.state, viewmat.to(moves.device), K.to(moves.device), width, height, weights).T
+    frozen = _hiding(frozen, moves & (total > SEEN) & (inside > 0.5 * total))
+    missing, inverse = missing_pixels(
+        picture, rendered(frozen), rendered(_hiding(frozen, moves)), matte, unit, config.plates
+    )
     at = missing > 0.5
     depth, colour = 1.0 / inverse[at], picture[at]
     if run.model.exposure.config.on:
@@ -84,51 +86,51 @@ def with_missing(
         "sh0": ((colour - 0.5) / SH_C0)[:, None],
         "shN": torch.zeros(len(depth), *frozen.state["shN"].shape[1:], device="cpu"),
     }
-    ones = frozen.support.new_ones(len(depth))
+    added_ones = frozen.support.new_ones(len(depth))
     return FrozenGaussians(
         {name: torch.cat([value, added[name].to(value)]) for name, value in frozen.state.items()},
-        frozen.sh_degree, torch.cat([frozen.support, ones]), torch.cat([frozen.motion, ones]),
+        frozen.sh_degree, torch.cat([frozen.support, added_ones]), torch.cat([frozen.motion, added_ones]),
     )  # fmt: skip
 
 
 def missing_pixels(
-    picture: Tensor, image: FrozenImage, behind: FrozenImage, matte: Tensor, unit: float, config: VisibilityConfig
+    picture: Tensor, image: FrozenImage, background: FrozenImage, matte: Tensor, unit: float, config: VisibilityConfig
 ) -> tuple[Tensor, Tensor]:
     """([h, w] in 0..1 share of each pixel that is missing and attached to a surface, [h, w] its inverse depth).
 
     Args:
         picture: [h, w, 3] plate t*, display-referred.
         image: the frozen scene from plate t*'s camera, scene units.
-        behind: the frozen scene without movers, from the same camera.
+        background: the frozen scene without movers, from the same camera.
         matte: [h, w] in 0..1, motion matte of plate t*.
         unit: pixels of the plate per pixel at width 640.
         config: tolerances.
     """
     sigma, reach = 2.0 * config.margin * unit, max(1, round(2.0 * config.margin * unit))
 
-    def unlike(shown: FrozenImage) -> Tensor:
-        return _sure((picture - shown.color).abs().amax(-1), config)
+    def difference(rendered: FrozenImage) -> Tensor:
+        return _sure((picture - rendered.color).abs().amax(-1), config)
 
     # Where the plate matches the background, nothing is missing: the scene shows a mover too many.
-    absent, other = (mismatch(picture, each.color, unit, config) for each in (image, behind))
-    gone = matte * torch.minimum(absent, other)
-    outline = torch.minimum(unlike(image), unlike(behind))
-    inverse, near = 1.0 / image.depth.clamp_min(1e-6), blurred(gone, sigma)
-    hidden = blurred(gone * inverse, sigma) / near.clamp_min(1e-6)
+    absent, background_mismatch = (mismatch(picture, render.color, unit, config) for render in (image, background))
+    missing = matte * torch.minimum(absent, background_mismatch)
+    outline = torch.minimum(difference(image), difference(background))
+    inverse, near = 1.0 / image.depth.clamp_min(1e-6), blurred(missing, sigma)
+    hidden = blurred(missing * inverse, sigma) / near.clamp_min(1e-6)
     nearer = (inverse / hidden.clamp_min(1e-12) - 1.0).clamp_min(0.0) / config.depth_tolerance
     holds = (1.0 - absent) * (1.0 - torch.exp(-nearer.square())) * (near > 1e-6)
-    depths = _depths(dilate(gone > 0.5, 2 * reach), gone, holds, inverse, 2.0 * np.pi * sigma**2)
-    return torch.minimum(gone, outline) * (depths > 0.0).float(), depths
+    depths = _depths(dilate(missing > 0.5, 2 * reach), missing, holds, inverse, 2.0 * np.pi * sigma**2)
+    return torch.minimum(missing, outline) * (depths > 0.0).float(), depths
 
 
-def mismatch(picture: Tensor, shown: Tensor, unit: float, config: VisibilityConfig) -> Tensor:
+def mismatch(picture: Tensor, rendered: Tensor, unit: float, config: VisibilityConfig) -> Tensor:
     """[h, w] in 0..1: confidence that a plate's colour does not occur in a render nearby.
 
-    `picture` and `shown` are [h, w, 3], display-referred. Blur and misplacement within the margin do not count, because
-    splats have both.
+    `picture` and `rendered` are [h, w, 3], display-referred. Blur and misplacement within the margin do not count,
+    because splats have both.
     """
     margin = config.margin * unit
-    return _sure(beyond(blurred(picture, margin), blurred(shown, margin), max(1, round(2.0 * margin))), config)
+    return _sure(beyond(blurred(picture, margin), blurred(rendered, margin), max(1, round(2.0 * margin))), config)
 
 
 def _sure(difference: Tensor, config: VisibilityConfig) -> Tensor:
@@ -141,14 +143,14 @@ def _hiding(frozen: FrozenGaussians, hidden: Tensor) -> FrozenGaussians:
     return replace(frozen, state={**frozen.state, "opacity_logits": opacity})
 
 
-def _depths(around: Tensor, gone: Tensor, holds: Tensor, inverse: Tensor, least: float) -> Tensor:
+def _depths(around: Tensor, missing: Tensor, holds: Tensor, inverse: Tensor, least: float) -> Tensor:
     """[h, w] inverse depth of each connected region of `around` (bool): the median weighted by `holds`.
 
-    It is 0 where a region is attached to nothing or has fewer than `least` missing pixels (`gone`).
+    It is 0 where a region is attached to nothing or has fewer than `least` missing pixels (`missing`).
     """
     count, labels = cv2.connectedComponents(around.byte().numpy())
     regions = np.asarray(labels, np.int32)
-    weights, values, amounts = (each.numpy() for each in (holds, inverse, gone))
+    weights, values, amounts = (layer.numpy() for layer in (holds, inverse, missing))
     deep = np.zeros(count, np.float32)
     for n in range(1, count):
         of = regions == n

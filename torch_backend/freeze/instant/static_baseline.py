@@ -37,7 +37,7 @@ from ..frozen import FrozenGaussians, freeze_at
 from ..views.reproject import project
 from ..views.source_views import MARGIN, MovingOf
 from ..views.working_plates import MEASURED_WIDTH, SEEN, VIEWS, WorkingPlates, showing, spread
-from .undersampled import AFAR
+from .undersampled import UNDERSAMPLED_RATIO
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class StaticBaselineConfig:
     """Scene flow in pixels at width 640, from t* to a plate, above which a Gaussian counts as moving and not as
     swaying. The advantage of the run over the baseline at that plate's time is then subtracted. People who hold still
     sway by less, and their mean is as good."""
-    nearer: float = 1.0 / AFAR
+    nearer: float = 1.0 / UNDERSAMPLED_RATIO
     """Distance of a plate's camera, relative to that of t*'s, up to which the plate sees a Gaussian from near."""
 
 
@@ -78,17 +78,17 @@ def apply_static_baseline(
         return frozen
     plates = WorkingPlates(scene, config.width, moving, MARGIN, frozen.support.device)
     movers = (plates.moving_share(frozen, t_star) > 0.5).float()
-    shown_at_t_star = showing(run.train_frames, t_star)
-    others = [frame for frame in spread(run.train_frames, config.plates) if frame not in shown_at_t_star]
-    left = rows[frozen.motion[rows] > 0.5]
-    if not len(left):
+    instant_frames = showing(run.train_frames, t_star)
+    plate_frames = [frame for frame in spread(run.train_frames, config.plates) if frame not in instant_frames]
+    candidates = rows[frozen.motion[rows] > 0.5]
+    if not len(candidates):
         return frozen
-    pair = _Pair(run, plates, frozen, with_still_means(run, frozen, left), left, movers, t_star, config)
-    near = _nearest(frozen.state["means"][left], config.neighbours)
-    gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
-    least = torch.where((movers[left] > 0.5) | pair.went, harm, config.doubted * harm)
+    pair = _Pair(run, plates, frozen, with_still_means(run, frozen, candidates), candidates, movers, t_star, config)
+    near = _nearest(frozen.state["means"][candidates], config.neighbours)
+    gain, harm = -pair.worse(instant_frames, near, still=False), pair.worse(plate_frames, near)
+    least = torch.where((movers[candidates] > 0.5) | pair.moved, harm, config.doubted * harm)
     stays = (harm <= 0.0) | (gain > least)
-    return frozen if bool(stays.all()) else with_still_means(run, frozen, left[~stays])
+    return frozen if bool(stays.all()) else with_still_means(run, frozen, candidates[~stays])
 
 
 @torch.no_grad()
@@ -108,7 +108,7 @@ class _Pair:
     """
 
     def __init__(
-        self, run: LoadedRun, plates: WorkingPlates, frozen: FrozenGaussians, twin: FrozenGaussians, rows: Tensor,
+        self, run: LoadedRun, plates: WorkingPlates, frozen: FrozenGaussians, baseline: FrozenGaussians, rows: Tensor,
         movers: Tensor, t_star: int, config: StaticBaselineConfig,
     ) -> None:  # fmt: skip
         self.sways = config.sways * plates.width / 640
@@ -116,8 +116,8 @@ class _Pair:
         places = frozen.state["means"][rows]
         self.from_near = config.nearer * norm(places - plates.centre(t_star), -1)
         """[M] distance in scene units up to which a plate sees each of the rows from near."""
-        self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, twin)
-        self.went = torch.zeros(len(rows), dtype=torch.bool, device=movers.device)
+        self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, baseline)
+        self.moved = torch.zeros(len(rows), dtype=torch.bool, device=movers.device)
         """bool [M]: True for Gaussians that move farther than a sway between t* and some compared plate."""
         self.marks = torch.stack([torch.zeros_like(movers).index_fill(0, rows, 1.0), movers], dim=1)
 
@@ -133,31 +133,36 @@ class _Pair:
         """
         sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
         for frame in frames:
-            worse, seen = self._blamed(frame, still).unbind(1)
+            worse, seen = self._attributed(frame, still).unbind(1)
             sees = seen[near].mean(1) > SEEN
             sums, counts = sums + torch.where(sees, worse[near].mean(1), 0.0), counts + sees
         return sums / counts.clamp_min(1.0)
 
-    def _blamed(self, frame: int, still: bool) -> Tensor:
+    def _attributed(self, frame: int, still: bool) -> Tensor:
         """[M, 2] per row, in a frame: squared error of the scene minus that of the baseline, and visible pixels."""
         camera, plate = self.plates.camera(frame), self.plates.picture(frame)
         ignored = self.plates.ignored(frame)
-        whole = torch.ones(plate.shape[:2], device=plate.device) > 0 if ignored is None else ~ignored
-        shown = [self._shown(scene, frame) for scene in self.scenes]
-        ours, twins = ((picture - plate).square().mean(-1) for picture, _ in shown)
-        paint = (shown[0][1][..., 0] + shown[1][1][..., 0]).clamp_min(1e-2)
-        masks = [whole]
+        valid = torch.ones(plate.shape[:2], device=plate.device) > 0 if ignored is None else ~ignored
+        renders = [self._render(scene, frame) for scene in self.scenes]
+        scene_errors, baseline_errors = ((picture - plate).square().mean(-1) for picture, _ in renders)
+        paint = (renders[0][1][..., 0] + renders[1][1][..., 0]).clamp_min(1e-2)
+        masks = [valid]
         if still:
-            rests = whole & (self.plates.matte(frame) < 0.5)
-            for _, marks in shown:
+            rests = valid & (self.plates.matte(frame) < 0.5)
+            for _, marks in renders:
                 rests = rests & (marks[..., 1] < 0.1)
             masks.append(rests)
-        own = torch.zeros_like(ours)
+        run_gain = torch.zeros_like(scene_errors)
         then = freeze_at(self.run.model, self.plates.scene.time_of_frame(frame), 1.0) if still else None
         if then is not None:
-            own = (twins - (self._shown(then, frame)[0] - plate).square().mean(-1)).clamp_min(0.0)
+            run_gain = (baseline_errors - (self._render(then, frame)[0] - plate).square().mean(-1)).clamp_min(0.0)
         stacked = torch.cat(
-            [torch.stack([(ours - twins) * mask / paint, mask.float(), own * mask / paint], dim=-1) for mask in masks],
+            [
+                torch.stack(
+                    [(scene_errors - baseline_errors) * mask / paint, mask.float(), run_gain * mask / paint], dim=-1
+                )
+                for mask in masks
+            ],
             dim=-1,
         )
         first, second = (gathered(scene.state, *camera, stacked)[self.rows] for scene in self.scenes)
@@ -166,9 +171,9 @@ class _Pair:
             return sums[:, 0, :2]
         near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), -1) <= self.from_near
         sums = torch.where(near[:, None], sums[:, 0], sums[:, 1])
-        went = self._travel(then, frame) > self.sways
-        self.went |= went & (sums[:, 1] > SEEN)
-        sums[:, 0] -= sums[:, 2] * (near | went)
+        moved = self._travel(then, frame) > self.sways
+        self.moved |= moved & (sums[:, 1] > SEEN)
+        sums[:, 0] -= sums[:, 2] * (near | moved)
         return sums[:, :2]
 
     def _travel(self, then: FrozenGaussians, frame: int) -> Tensor:
@@ -180,7 +185,7 @@ class _Pair:
         return norm(pixels_now - pixels_then, -1)
 
     @torch.no_grad()
-    def _shown(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:
+    def _render(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:
         """(picture [H, W, 3] in 0..1, marks [H, W, 2]) of a scene from the camera of a frame, on a grey background."""
         grey = torch.tensor([0.5, 0.5, 0.5, 0.0, 0.0], device=self.marks.device)
         out = render(

@@ -10,7 +10,7 @@ from ...scene import Scene
 from ...torch_types import norm
 from ...train import LoadedRun
 
-AFAR = 2.0
+UNDERSAMPLED_RATIO = 2.0
 """Ratio of plate t*'s distance to the nearest frame's distance above which a Gaussian is undersampled."""
 
 

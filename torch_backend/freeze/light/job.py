@@ -87,7 +87,7 @@ def make_light(
     digest = file_digest(folder.facts)
     key = content_key(LIGHT_VERSION, digest, file_digest(folder.ply), point.tolist(), placement.to_json(), vars(config))
     facts = light_of_take(folder, key)
-    is_made = facts is None
+    is_new = facts is None
     if facts is None:
         facts = _rendered(shot, folder, key, point, placement, report, config)
     return {
@@ -96,7 +96,7 @@ def make_light(
         "light": str(folder.light(key)),
         "position": facts.position,
         "filled": facts.filled,
-        "made": is_made,
+        "made": is_new,
     }
 
 
@@ -167,15 +167,15 @@ def seen_from(
     smear are left out, see `LightConfig`. JobError if there are no splats around the point.
     """
     means = from_numpy(splats.means).double() - from_numpy(point)
-    apart = norm(means, -1)
-    unit = float(apart.median()) if len(apart) else 0.0
+    distances = norm(means, -1)
+    unit = float(distances.median()) if len(distances) else 0.0
     if not unit > 0.0:
         raise JobError("The take has no splats around that point.", "Choose another point.", ExitCode.USAGE)
-    means, apart = means / unit, apart / unit
+    means, distances = means / unit, distances / unit
     quats, log_scales = from_numpy(splats.quats), from_numpy(splats.log_scales).double() - np.log(unit)
     within = (means[:, None] @ rotation_matrices(quats.double()))[:, 0] / log_scales.exp().clamp_min(1e-12)
-    share = (apart / config.near - 1.0).clamp(0.0, 1.0) * (norm(within, -1) > config.inside)
-    share = share * (log_scales.exp().amax(-1) < config.wide * apart)
+    share = (distances / config.near - 1.0).clamp(0.0, 1.0) * (norm(within, -1) > config.inside)
+    share = share * (log_scales.exp().amax(-1) < config.wide * distances)
     opacity = torch.sigmoid(from_numpy(splats.opacity_logits).double()) * share
     rows = share > 0.0
     towards = (from_numpy(cameras) - from_numpy(point)) / unit
@@ -194,30 +194,30 @@ def _colors(sh: Tensor, means: Tensor, cameras: Tensor) -> Tensor:
     The nearest direction is the one with the smallest angle to the direction from the origin to the mean.
     """
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
-    wanted = means / norm(means, -1, keepdim=True)
-    best, along = torch.full((len(means),), -2.0), wanted.clone()
+    directions = means / norm(means, -1, keepdim=True)
+    best, along = torch.full((len(means),), -2.0), directions.clone()
     for camera in cameras if degree else ():
         ray = means - camera
         ray = ray / norm(ray, -1, keepdim=True).clamp_min(1e-9)
-        cosine = (ray * wanted).sum(-1)
+        cosine = (ray * directions).sum(-1)
         along = torch.where((cosine > best)[:, None], ray, along)
         best = torch.maximum(best, cosine)
     return ((sh_basis(along, degree)[..., None] * sh).sum(1) + 0.5).clamp_min(0.0)
 
 
-def _exposed(shot: Shot, told: dict[str, Any], scene: Scene, colors: Tensor, report: Reporter) -> Tensor:
+def _exposed(shot: Shot, facts: dict[str, Any], scene: Scene, colors: Tensor, report: Reporter) -> Tensor:
     """Colours [N, 3] with the exposure of the clip's camera at t*; unchanged if the take's run no longer exists."""
     try:
-        run = load_run(shot, str(told.get("run", "")))
+        run = load_run(shot, str(facts.get("run", "")))
     except (JobError, ValueError):
         run = None
-    if run is None or run.stamp != told.get("checkpoint"):
+    if run is None or run.stamp != facts.get("checkpoint"):
         report.warning(
             "The run of this take was trained or removed since: the light has its mean exposure, not the one at t*.",
             "Freeze the take again.",
         )
         return colors
-    return exposed_as(run, scene, float(told["t_star_frame"]), colors)
+    return exposed_as(run, scene, float(facts["t_star_frame"]), colors)
 
 
 def exposed_as(run: LoadedRun, scene: Scene, frame: float, colors: Tensor) -> Tensor:
@@ -242,7 +242,7 @@ def render_panorama(
     """
     focal, side = sphere.face_camera(config.width)
     K = torch.tensor([[focal, 0.0, side / 2.0], [0.0, focal, side / 2.0], [0.0, 0.0, 1.0]])
-    apart = norm(splats.means, -1)
+    distances = norm(splats.means, -1)
     done = 0
 
     def face(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -252,7 +252,7 @@ def render_panorama(
         done += 1
         viewmat = torch.eye(4)
         viewmat[:3, :3] = from_numpy(rotation @ turn).float()
-        rows = splats.means @ viewmat[2, :3] > config.cone * apart
+        rows = splats.means @ viewmat[2, :3] > config.cone * distances
         with torch.no_grad():
             out = rasterize(
                 splats.means[rows],

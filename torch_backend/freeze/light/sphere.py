@@ -84,9 +84,9 @@ def _smaller(picture: NDArray[np.float32], rows: int) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(picture, (2 * rows, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _fade(across: NDArray[np.float32], ahead: NDArray[np.float32]) -> NDArray[np.float32]:
+def _fade(sideways: NDArray[np.float32], forward: NDArray[np.float32]) -> NDArray[np.float32]:
     """Weight of a face by the angle from its axis: 1 up to 40 degrees, 0 from `HALF_FACE` on."""
-    beyond = HALF_FACE - np.abs(np.arctan2(across, ahead))
+    beyond = HALF_FACE - np.abs(np.arctan2(sideways, forward))
     return np.clip(beyond / np.float32(2.0 * (HALF_FACE - math.pi / 4.0)), 0.0, 1.0).astype(np.float32)
 
 
@@ -109,7 +109,7 @@ def filled(picture: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     rows = _COARSEST
     while True:
         small = picture if rows == height else _smaller(picture, rows)
-        start = _weighted(small) if color is None else _twice(color)
+        start = _weighted(small) if color is None else _upsampled(color)
         color = _relaxed(small, start)
         if rows == height:
             return color, min(max(share, 0.0), 1.0)
@@ -122,12 +122,12 @@ def _weighted(small: NDArray[np.float32]) -> NDArray[np.float32]:
     along = directions(width, height).reshape(-1, 3)
     areas = np.broadcast_to(solid_angles(width, height), (height, width)).reshape(-1, 1)
     known = (small.reshape(-1, 4) * areas).astype(np.float32)
-    apart = np.maximum(2.0 - 2.0 * along @ along.T, 0.0) + np.float32((math.pi / height) ** 2)  # squared chords
-    sums = (1.0 / np.square(apart)) @ known
+    squared_chords = np.maximum(2.0 - 2.0 * along @ along.T, 0.0) + np.float32((math.pi / height) ** 2)
+    sums = (1.0 / np.square(squared_chords)) @ known
     return (sums[:, :3] / sums[:, 3:]).reshape(height, width, 3).astype(np.float32)
 
 
-def _twice(color: NDArray[np.float32]) -> NDArray[np.float32]:
+def _upsampled(color: NDArray[np.float32]) -> NDArray[np.float32]:
     """A panorama [h, w, 3] at twice the size, bilinear, wrapped around horizontally."""
     around = np.concatenate([color[:, -1:], color, color[:, :1]], axis=1)
     large = cv2.resize(around, (2 * around.shape[1], 2 * len(around)), interpolation=cv2.INTER_LINEAR)
@@ -138,18 +138,18 @@ def _relaxed(small: NDArray[np.float32], start: NDArray[np.float32]) -> NDArray[
     """[h, w, 3]: `start` relaxed towards the membrane whose boundary is the covered part of a panorama [h, w, 4]."""
     height = len(small)
     alpha = np.clip(small[..., 3:], 0.0, 1.0)
-    held = np.where(alpha > 1e-4, small[..., :3], 0.0)
+    fixed = np.where(alpha > 1e-4, small[..., :3], 0.0)
     loose = np.where(alpha > 1e-4, 1.0 - alpha, 1.0)
     # Laplacian of the sphere on a regular grid of latitude and longitude: circles of latitude shrink towards the poles.
     edges = np.cos(np.pi / 2.0 - np.pi * np.arange(height + 1) / height)[:, None, None]
     middles = np.cos(np.pi / 2.0 - np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
-    up, down, aside = edges[:-1] * middles, edges[1:] * middles, np.ones_like(middles)
-    total = up + down + 2.0 * aside
-    up, down, aside = ((part / total).astype(np.float32) for part in (up, down, aside))
+    up, down, horizontal = edges[:-1] * middles, edges[1:] * middles, np.ones_like(middles)
+    total = up + down + 2.0 * horizontal
+    up, down, horizontal = ((part / total).astype(np.float32) for part in (up, down, horizontal))
     color = start
     for _ in range(_SWEEPS):
         above = np.concatenate([color[:1], color[:-1]])
         below = np.concatenate([color[1:], color[-1:]])
-        mean = up * above + down * below + aside * (np.roll(color, 1, axis=1) + np.roll(color, -1, axis=1))
-        color = np.asarray(held + loose * mean, np.float32)
+        mean = up * above + down * below + horizontal * (np.roll(color, 1, axis=1) + np.roll(color, -1, axis=1))
+        color = np.asarray(fixed + loose * mean, np.float32)
     return color

@@ -61,16 +61,16 @@ def carry(
     """
     order = in_order(polygons, frames)
     lassoed = [number for number in order if any(number in of for of in polygons.values())]
-    drawn: dict[tuple[int, str], Matte] = {}
+    lasso_mattes: dict[tuple[int, str], Matte] = {}
     votes: dict[str, Tensor] = {}
     for number in lassoed:
         frame = read(number)
         for name, of in polygons.items():
             for polygon in of.get(number, ()):
                 found = segment_lasso(frame.picture, frame.depth, polygon + np.array(frame.beyond), config)
-                before = drawn.get((number, name))
-                drawn[number, name] = found if before is None else np.maximum(found, before)
-        of_frame = {name: drawn[number, name] for name in polygons if (number, name) in drawn}
+                before = lasso_mattes.get((number, name))
+                lasso_mattes[number, name] = found if before is None else np.maximum(found, before)
+        of_frame = {name: lasso_mattes[number, name] for name in polygons if (number, name) in lasso_mattes}
         _add(votes, _votes_of(of_frame, frame, frozen_at(frame.t_star)))
     for number in order:
         frame = read(number)
@@ -79,9 +79,9 @@ def carry(
             votes = {name: rule_out(vote, frozen.state["means"]) for name, vote in votes.items()}
         mattes: dict[str, Matte] = {}
         for name in polygons:
-            lasso = drawn.get((number, name))
+            lasso = lasso_mattes.get((number, name))
             mattes[name] = _refined(votes[name], frozen, frame, config) if lasso is None else lasso
-        carried = {name: matte for name, matte in mattes.items() if (number, name) not in drawn}
+        carried = {name: matte for name, matte in mattes.items() if (number, name) not in lasso_mattes}
         _add(votes, _votes_of(carried, frame, frozen))
         yield frame, mattes
 
@@ -89,14 +89,14 @@ def carry(
 def _refined(votes: Tensor, frozen: FrozenGaussians, frame: TakeFrame, config: SegmentConfig | None) -> Matte:
     """The matte [H, W] at a frame of the object with votes [N, 2]."""
     height, width = frame.depth.shape
-    shown = render_members(frozen, membership(votes), frame.viewmat, frame.K, width, height, frame.beyond)
-    return refine(frame.picture, frame.depth, shown[..., 0].numpy(), shown[..., 1].numpy(), config)
+    rendered = render_members(frozen, membership(votes), frame.viewmat, frame.K, width, height, frame.beyond)
+    return refine(frame.picture, frame.depth, rendered[..., 0].numpy(), rendered[..., 1].numpy(), config)
 
 
-def _add(votes: dict[str, Tensor], told: Mapping[str, Tensor]) -> None:
-    """Adds the votes `told` to `votes` in place."""
-    for name, more in told.items():
-        votes[name] = votes[name] + more if name in votes else more
+def _add(votes: dict[str, Tensor], added: Mapping[str, Tensor]) -> None:
+    """Adds the votes `added` to `votes` in place."""
+    for name, counts in added.items():
+        votes[name] = votes[name] + counts if name in votes else counts
 
 
 def _votes_of(mattes: Mapping[str, Matte], frame: TakeFrame, frozen: FrozenGaussians) -> dict[str, Tensor]:

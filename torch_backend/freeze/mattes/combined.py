@@ -83,10 +83,10 @@ class Source:
         For a frozen object, motion farther than `FAR` times its depth is set to 0, such as sky in the motion mattes.
         """
         matte, motion = self.matte(name, number), frame.motion
-        others = [self.matte(other, number) for other in self.matte_keys if other != name]
+        remaining = [self.matte(key, number) for key in self.matte_keys if key != name]
         if not is_live and (matte > 0.5).any():
             motion = motion * (frame.depth < FAR * np.quantile(frame.depth[matte > 0.5], 0.9))
-        return np.stack([matte, np.maximum.reduce([np.zeros_like(matte), *others]), motion])
+        return np.stack([matte, np.maximum.reduce([np.zeros_like(matte), *remaining]), motion])
 
 
 def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, Any]:
@@ -137,9 +137,9 @@ def things_of(text: str) -> dict[str, str]:
     return found
 
 
-def combined(base: FrozenFrame, other: FrozenFrame, mask: Array) -> FrozenFrame:
-    """`other` where `mask` [H, W] is 1, `base` where it is 0. Depth, `source` and `more` are chosen, not blended."""
-    is_other = mask > 0.5
+def combined(base: FrozenFrame, overlay: FrozenFrame, mask: Array) -> FrozenFrame:
+    """`overlay` where `mask` [H, W] is 1, `base` where it is 0. Depth, `source` and `more` are chosen, not blended."""
+    is_overlay = mask > 0.5
 
     def mixed(a: object, b: object) -> Array:
         one, two = np.asarray(a, np.float32), np.asarray(b, np.float32)
@@ -148,46 +148,46 @@ def combined(base: FrozenFrame, other: FrozenFrame, mask: Array) -> FrozenFrame:
 
     def chosen(a: object, b: object) -> Array:
         one, two = np.asarray(a, np.float32), np.asarray(b, np.float32)
-        return np.where(is_other if one.ndim == 2 else is_other[..., None], two, one)
+        return np.where(is_overlay if one.ndim == 2 else is_overlay[..., None], two, one)
 
     detail = None
-    if base.detail is not None and other.detail is not None:
-        one, two = base.detail, other.detail
+    if base.detail is not None and overlay.detail is not None:
+        one, two = base.detail, overlay.detail
         detail = DetailLayers(
             mixed(one.splat, two.splat), mixed(one.plate, two.plate), chosen(one.source, two.source)
         )  # fmt: skip
     return dataclasses.replace(
         base,
-        rgba=mixed(base.rgba, other.rgba),
-        depth=chosen(base.depth, other.depth),
-        support=mixed(base.support, other.support),
-        motion=mixed(base.motion, other.motion),
-        grain=None if base.grain is None or other.grain is None else mixed(base.grain, other.grain),
+        rgba=mixed(base.rgba, overlay.rgba),
+        depth=chosen(base.depth, overlay.depth),
+        support=mixed(base.support, overlay.support),
+        motion=mixed(base.motion, overlay.motion),
+        grain=None if base.grain is None or overlay.grain is None else mixed(base.grain, overlay.grain),
         detail=detail,
-        more={name: chosen(layer, other.more[name]) for name, layer in base.more.items() if name in other.more},
+        more={name: chosen(layer, overlay.more[name]) for name, layer in base.more.items() if name in overlay.more},
     )
 
 
-def grown(matte: Array, width: int) -> Array:
+def dilated(matte: Array, width: int) -> Array:
     """A matte [H, W] dilated by `GROW` pixels at width 640, with a soft border."""
     reach = max(1, round(GROW * width / 640))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return np.asarray(cv2.GaussianBlur(cv2.dilate(matte, kernel), (0, 0), 0.5 * reach), np.float32)
 
 
-def with_motion(matte: Array, others: Array, motion: Array) -> Array:
+def with_motion(matte: Array, neighbours: Array, motion: Array) -> Array:
     """A matte [H, W] extended by the moving regions that touch it.
 
     Such a region is a hand that the matte missed, or the object at its place in the live plate. `motion` [H, W] is the
-    layer of a frozen frame: pixels that move at t* or in the frame's own plate. Moving pixels nearer to `others`
+    layer of a frozen frame: pixels that move at t* or in the frame's own plate. Moving pixels nearer to `neighbours`
     [H, W], the union of all other mattes, are left out.
     """
-    in_thing, in_others = matte > 0.5, (others > 0.5) & (others > matte)
-    joined = in_thing | (motion > 0.5)
-    if in_others.any():
-        joined &= _distance(in_thing) <= _distance(in_others)
+    in_object, in_neighbours = matte > 0.5, (neighbours > 0.5) & (neighbours > matte)
+    joined = in_object | (motion > 0.5)
+    if in_neighbours.any():
+        joined &= _distance(in_object) <= _distance(in_neighbours)
     _, labels = cv2.connectedComponents(joined.astype(np.uint8))
-    touched = np.unique(labels[in_thing & joined])
+    touched = np.unique(labels[in_object & joined])
     return np.maximum(matte, np.isin(labels, touched[touched > 0]).astype(np.float32))
 
 
@@ -214,10 +214,12 @@ def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source
     frames = set(frames_of(base.folder))
     for matte, take in things.items():
         source = sources[take]
-        for each in (base, source):
-            if each is not None and matte not in each.matte_keys:
+        for candidate in (base, source):
+            if candidate is not None and matte not in candidate.matte_keys:
                 raise JobError(
-                    f"Take {each.name} has no matte {matte!r}.", "Draw it there, or make its mattes.", ExitCode.FREEZE
+                    f"Take {candidate.name} has no matte {matte!r}.",
+                    "Draw it there, or make its mattes.",
+                    ExitCode.FREEZE,
                 )
         if source is None:
             if base.facts.get("camera_path"):
@@ -262,7 +264,7 @@ def _write_frame(
     if is_current(folder.preview(number), key) and is_current(folder.frame(number), key):
         return
     frame = read_frozen_exr(base.folder.frame(number))
-    shown = read_png(base.folder.preview(number)).astype(np.float32)
+    preview = read_png(base.folder.preview(number)).astype(np.float32)
     (height, width), (across, down) = frame.depth.shape, base.margin
     inner = slice(down, height - down), slice(across, width - across)
     for matte, take in things.items():
@@ -270,18 +272,18 @@ def _write_frame(
         shows = base.shows(matte, number, frame, is_live=source is None)
         if source is None:
             assert live is not None
-            whole, mask = grown(with_motion(*shows), width), np.zeros_like(frame.depth)
-            mask[inner] = whole[inner]  # the plate does not cover the overscan
-            other = _living_frame(frame, live, number, inner)
+            object_mask, mask = dilated(with_motion(*shows), width), np.zeros_like(frame.depth)
+            mask[inner] = object_mask[inner]  # the plate does not cover the overscan
+            overlay = _living_frame(frame, live, number, inner)
             picture = np.asarray(live.display(number).clamp(0.0, 1.0).numpy() * 255.0, np.float32)
         else:
-            other = read_frozen_exr(source.folder.frame(number))
-            mask = grown(with_motion(*np.maximum(shows, source.shows(matte, number, other, is_live=False))), width)
+            overlay = read_frozen_exr(source.folder.frame(number))
+            mask = dilated(with_motion(*np.maximum(shows, source.shows(matte, number, overlay, is_live=False))), width)
             picture = read_png(source.folder.preview(number)).astype(np.float32)
         share = mask[inner][..., None]
-        shown = shown * (1.0 - share) + picture * share
-        frame = combined(frame, other, mask)
-    write_png(folder.preview(number), (shown + 0.5).astype(np.uint8), key)
+        preview = preview * (1.0 - share) + picture * share
+        frame = combined(frame, overlay, mask)
+    write_png(folder.preview(number), (preview + 0.5).astype(np.uint8), key)
     write_frozen_exr(
         folder.frame(number), frame.rgba, frame.depth, frame.support, frame.motion,
         dataclasses.replace(frame.metadata, key=key), frame.margin, frame.grain, frame.detail, frame.more,
@@ -321,9 +323,9 @@ def _finish(
     note = write_video(folder.video, (read_png(path) for path in previews), shot.info().fps or 24.0)
     if note:
         report.warning(note)
-    own = ("deep", "detail", "warp_dir", "verdict", "ply", "usd", "redistort")
+    take_specific = ("deep", "detail", "warp_dir", "verdict", "ply", "usd", "redistort")
     facts = {
-        **{name: value for name, value in base.facts.items() if name not in own},
+        **{name: value for name, value in base.facts.items() if name not in take_specific},
         "take": params.take,
         "combined": {"base": params.base, "things": things_of(params.things)},
         "key": content_key([read_key(folder.frame(number)) for number in frames]),

@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ...contract import CRYPTOMATTE, layers_of
-from ..exr import Made, linear_spec, set_margin, write_exr
+from ..exr import LazyLayer, linear_spec, set_margin, write_exr
 
 LAYERS = layers_of(CRYPTOMATTE)
 PAIRS = 2 * len(LAYERS)
@@ -29,13 +29,13 @@ _MASK = 0xFFFFFFFF
 def murmur3(data: bytes, seed: int = 0) -> int:
     """MurmurHash3_x86_32 (Appleby, public domain) of bytes."""
     hashed = seed
-    whole = len(data) // 4 * 4
-    blocks = [*struct.unpack(f"<{whole // 4}I", data[:whole]), int.from_bytes(data[whole:], "little")]
+    block_bytes = len(data) // 4 * 4
+    blocks = [*struct.unpack(f"<{block_bytes // 4}I", data[:block_bytes]), int.from_bytes(data[block_bytes:], "little")]
     for n, block in enumerate(blocks):
         block = block * 0xCC9E2D51 & _MASK
         block = _turned(block, 15) * 0x1B873593 & _MASK
         hashed ^= block
-        if n < whole // 4:  # MurmurHash3 omits this step for a tail of fewer than four bytes
+        if n < block_bytes // 4:  # MurmurHash3 omits this step for a tail of fewer than four bytes
             hashed = (_turned(hashed, 13) * 5 + 0xE6546B64) & _MASK
     hashed ^= len(data)
     hashed = (hashed ^ hashed >> 16) * 0x85EBCA6B & _MASK
@@ -92,7 +92,7 @@ def write_cryptomatte(
     names = tuple(channel for layer in LAYERS for channel in layer.channels)
     spec = linear_spec(shape[1], shape[0], names, (oiio.FLOAT,) * len(names))
     layer = CRYPTOMATTE
-    where = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
+    prefix = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
     attributes = {
         "name": layer,
         "hash": "MurmurHash3_32",
@@ -100,7 +100,7 @@ def write_cryptomatte(
         "manifest": manifest([*mattes]),
     }
     for name, value in attributes.items():
-        spec.attribute(f"{where}/{name}", value)
+        spec.attribute(f"{prefix}/{name}", value)
     if key:
         spec.attribute("splannequin:key", key)
     set_margin(spec, margin)
@@ -108,4 +108,4 @@ def write_cryptomatte(
     def rows(of: slice) -> NDArray[np.float32]:
         return ranked({name: matte[of] for name, matte in mattes.items()})
 
-    return write_exr(Path(path), spec, [Made((*shape, 2 * PAIRS), rows)])
+    return write_exr(Path(path), spec, [LazyLayer((*shape, 2 * PAIRS), rows)])

@@ -54,6 +54,6 @@ def is_current(path: Path, key: str) -> bool:
     return is_whole_picture(path) and read_key(path) == key
 
 
-def suffixes_beside(suffix: str) -> list[str]:
+def remaining_suffixes(suffix: str) -> list[str]:
     """The formats in `MATTE_FORMATS` other than `suffix`."""
-    return [other for other in MATTE_FORMATS if other != suffix]
+    return [candidate for candidate in MATTE_FORMATS if candidate != suffix]

@@ -33,7 +33,7 @@ from ..instant.instants import Instants
 from ..take.folder import frames_of
 from .carry import TakeFrame, carry, in_order
 from .cryptomatte import write_cryptomatte
-from .files import is_current, matte_file, read_matte, suffixes_beside, write_matte
+from .files import is_current, matte_file, read_matte, remaining_suffixes, write_matte
 from .lassos import Lasso, json_list, lasso_of, read_lassos
 from .segment import Matte, SegmentConfig
 
@@ -68,17 +68,17 @@ def make_mattes(shot: Shot, params: MatteParams, report: Reporter) -> dict[str, 
     """
     take = _opened(shot, params.take)
     lassos = _lassos(take, params)
-    wanted: dict[str, list[Lasso]] = {}
+    lassos_by_name: dict[str, list[Lasso]] = {}
     for lasso in lassos:
-        wanted.setdefault(lasso.name, []).append(lasso)
-    for inner in (take.folder.mattes, take.folder.cryptomattes, *map(take.folder.matte_frames, wanted)):
+        lassos_by_name.setdefault(lasso.name, []).append(lasso)
+    for inner in (take.folder.mattes, take.folder.cryptomattes, *map(take.folder.matte_frames, lassos_by_name)):
         make_folder(shot.own(inner))
         sweep_half_written(inner)
     pixels = (int(take.facts["width"]) + 2 * take.margin[0]) * (int(take.facts["height"]) + 2 * take.margin[1])
-    need_disk(take.folder.root, len(take.frames) * pixels * (4.0 + len(wanted)), "the mattes")
-    keys = _keys(take, wanted)
+    need_disk(take.folder.root, len(take.frames) * pixels * (4.0 + len(lassos_by_name)), "the mattes")
+    keys = _keys(take, lassos_by_name)
     stale = {
-        name: of for name, of in wanted.items()
+        name: of for name, of in lassos_by_name.items()
         if not all(is_current(matte_file(take.folder, name, n, params.matte_format), keys[name]) for n in take.frames)
     }  # fmt: skip
     record = {
@@ -90,17 +90,17 @@ def make_mattes(shot: Shot, params: MatteParams, report: Reporter) -> dict[str, 
     }
     try:
         write_json(take.folder.mattes_record, record)  # a cancelled job must not lose lassos
-        _write(shot, take, params, wanted, stale, keys, report)
-        _sweep(take, params, wanted)
+        _write(shot, take, params, lassos_by_name, stale, keys, report)
+        _sweep(take, params, lassos_by_name)
         write_json(take.folder.mattes_record, {**record, "finished": True})
     except OSError as error:
         raise (disk_error(take.folder.root) if is_disk_full(error) else error) from error
     return {
         "take": params.take,
         "frames": len(take.frames),
-        "mattes": {name: str(take.folder.matte_frames(name)) for name in wanted},
+        "mattes": {name: str(take.folder.matte_frames(name)) for name in lassos_by_name},
         "made": list(stale),
-        "cryptomatte": str(take.folder.cryptomattes) if wanted else "",
+        "cryptomatte": str(take.folder.cryptomattes) if lassos_by_name else "",
     }
 
 
@@ -139,9 +139,9 @@ def _lassos(take: _Take, params: MatteParams) -> list[Lasso]:
             raise JobError(f"The take has no matte {params.remove!r}.", "Check its name.", ExitCode.USAGE)
         lassos = [lasso for lasso in lassos if lasso.name != params.remove]
     if params.polygons:
-        drawn = read_lassos(params.polygons, *size)
-        names = {lasso.name for lasso in drawn}
-        lassos = [lasso for lasso in lassos if lasso.name not in names] + drawn
+        added = read_lassos(params.polygons, *size)
+        names = {lasso.name for lasso in added}
+        lassos = [lasso for lasso in lassos if lasso.name not in names] + added
     if not lassos and not params.remove:
         raise JobError("The take has no lassos yet.", "Give a file of them with --polygons.", ExitCode.USAGE)
     folded = [name.casefold() for name in dict.fromkeys(lasso.name for lasso in lassos)]
@@ -169,38 +169,39 @@ def _lassos(take: _Take, params: MatteParams) -> list[Lasso]:
     return lassos
 
 
-def _keys(take: _Take, wanted: Mapping[str, list[Lasso]]) -> dict[str, str]:
+def _keys(take: _Take, lassos_by_name: Mapping[str, list[Lasso]]) -> dict[str, str]:
     """Name -> key of the matte's inputs. All frames are included, because every frame votes on the matte."""
-    shown = [[n, read_key(take.folder.frame(n))] for n in take.frames]
-    how = dataclasses.asdict(SegmentConfig())
+    frame_keys = [[n, read_key(take.folder.frame(n))] for n in take.frames]
+    settings = dataclasses.asdict(SegmentConfig())
     return {
-        name: content_key(_METHOD, shown, [[one.frame, one.polygon] for one in of], how) for name, of in wanted.items()
+        name: content_key(_METHOD, frame_keys, [[lasso.frame, lasso.polygon] for lasso in of], settings)
+        for name, of in lassos_by_name.items()
     }
 
 
 def _write(
-    shot: Shot, take: _Take, params: MatteParams, wanted: Mapping[str, list[Lasso]], stale: Mapping[str, list[Lasso]],
-    keys: Mapping[str, str], report: Reporter,
+    shot: Shot, take: _Take, params: MatteParams, lassos_by_name: Mapping[str, list[Lasso]],
+    stale: Mapping[str, list[Lasso]], keys: Mapping[str, str], report: Reporter,
 ) -> None:  # fmt: skip
     """Writes the outdated mattes, and the Cryptomattes that contain one of these or a removed matte."""
-    if not wanted:
+    if not lassos_by_name:
         return
-    whole = content_key(_METHOD, {name: keys[name] for name in wanted})
+    cryptomatte_key = content_key(_METHOD, {name: keys[name] for name in lassos_by_name})
     none: Iterator[tuple[int, dict[str, Matte]]] = ((number, {}) for number in take.frames)
-    made = _carried(shot, take, params, stale, report) if stale else none
-    for done, (number, mattes) in enumerate(made):
+    carried = _carried(shot, take, params, stale, report) if stale else none
+    for done, (number, mattes) in enumerate(carried):
         report.progress("making mattes", done, len(take.frames), f"frame {number}")
         report.check_cancelled()
         for name, matte in mattes.items():
             write_matte(matte_file(take.folder, name, number, params.matte_format), matte, take.margin, keys[name])
         path = take.folder.cryptomatte(number)
-        if mattes or not is_current(path, whole):
+        if mattes or not is_current(path, cryptomatte_key):
             every = {
                 name: mattes[name] if name in mattes
                 else read_matte(matte_file(take.folder, name, number, params.matte_format), take.margin)
-                for name in wanted
+                for name in lassos_by_name
             }  # fmt: skip
-            write_cryptomatte(path, every, take.margin, whole)
+            write_cryptomatte(path, every, take.margin, cryptomatte_key)
     report.progress("making mattes", len(take.frames), len(take.frames), f"{len(take.frames)} frames")
 
 
@@ -221,13 +222,13 @@ def _carried(
         for lasso in of:
             polygons.setdefault(name, {}).setdefault(lasso.frame, []).append(lasso.corners())
     order = in_order(polygons, take.frames)
-    held: dict[int, TakeFrame] = {}
+    cached: dict[int, TakeFrame] = {}
 
     def read(number: int) -> TakeFrame:
-        if number not in held:
-            held.clear()  # one frame is enough: a single lassoed frame is requested twice in a row
-            held[number] = read_take_frame(take.folder, number, scene)
-        return held[number]
+        if number not in cached:
+            cached.clear()  # one frame is enough: a single lassoed frame is requested twice in a row
+            cached[number] = read_take_frame(take.folder, number, scene)
+        return cached[number]
 
     instants = [read(n).t_star for n in take.frames] if take.facts.get("t_star_per_frame") else [read(order[0]).t_star]
     frozen = Instants(shot, run, scene, str(take.facts["query"]), instants, "developed" in take.facts)
@@ -248,20 +249,20 @@ def read_take_frame(folder: TakeFolder, number: int, scene: Scene) -> TakeFrame:
     return TakeFrame(number, picture, depth, viewmat, K, frame.margin, frame.metadata.t_star_frame)
 
 
-def _sweep(take: _Take, params: MatteParams, wanted: Mapping[str, list[Lasso]]) -> None:
+def _sweep(take: _Take, params: MatteParams, lassos_by_name: Mapping[str, list[Lasso]]) -> None:
     """Removes single mattes of other names and formats, and mattes of frames that are not in the take."""
     keep = set(take.frames)
     with contextlib.suppress(FileNotFoundError):
         for old in [*take.folder.single_mattes.iterdir()]:
-            if old.name not in wanted and old.is_dir() and not old.is_symlink():
+            if old.name not in lassos_by_name and old.is_dir() and not old.is_symlink():
                 shutil.rmtree(old, ignore_errors=True)
-    for name in wanted:
-        for suffix in (params.matte_format, *suffixes_beside(params.matte_format)):
+    for name in lassos_by_name:
+        for suffix in (params.matte_format, *remaining_suffixes(params.matte_format)):
             for file in take.folder.matte_frames(name).glob(f"*.{suffix}"):
                 if suffix != params.matte_format or not _is_of(file, keep):
                     remove_file(file)
     for file in take.folder.cryptomattes.glob("*.exr"):
-        if not wanted or not _is_of(file, keep):
+        if not lassos_by_name or not _is_of(file, keep):
             remove_file(file)
 
 

@@ -47,9 +47,9 @@ def in_front(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, depth: Tensor)
 
     Splats of a person are not opaque. Without this test, a wall that shines through would become part of the person.
     """
-    pixels, away = project(frozen.state["means"], viewmat, K)
+    pixels, distances = project(frozen.state["means"], viewmat, K)
     surface = look_up(depth.to(pixels.device), pixels, "nearest")
-    return away < surface * (1.0 + THICK)
+    return distances < surface * (1.0 + THICK)
 
 
 def membership(votes: Tensor) -> Tensor:
@@ -58,9 +58,9 @@ def membership(votes: Tensor) -> Tensor:
     `votes` [N, 2] are the Gaussian's pixels inside mattes, and all its pixels. Gaussians with more than `SEEN` pixels
     are known.
     """
-    within, whole = votes.unbind(1)
-    known = whole > SEEN
-    return torch.stack([torch.where(known, within / whole.clamp_min(1e-9), 0.0), known.to(within)], dim=1)
+    inside, total = votes.unbind(1)
+    known = total > SEEN
+    return torch.stack([torch.where(known, inside / total.clamp_min(1e-9), 0.0), known.to(inside)], dim=1)
 
 
 def rule_out(votes: Tensor, means: Tensor) -> Tensor:
@@ -70,8 +70,8 @@ def rule_out(votes: Tensor, means: Tensor) -> Tensor:
     """
     share, known = membership(votes).unbind(1)
     members = (share > 0.5).cpu()
-    unseen = (known < 0.5).cpu()
-    if not bool(members.any()) or not bool(unseen.any()):
+    is_unknown = (known < 0.5).cpu()
+    if not bool(members.any()) or not bool(is_unknown.any()):
         return votes
     places = means.detach().cpu().double().numpy()
     low, high = np.quantile(places[members.numpy()], (0.02, 0.98), axis=0)  # excludes floaters
@@ -79,9 +79,9 @@ def rule_out(votes: Tensor, means: Tensor) -> Tensor:
     core = core[((core >= low) & (core <= high)).all(1)]
     if not len(core):
         return votes
-    distance, _ = nearest(core, places[unseen.numpy()], 1, workers=-1)
-    far = torch.zeros_like(unseen)
-    far[unseen] = from_numpy(distance[:, 0] > RIM * float(np.linalg.norm(high - low)))
+    distance, _ = nearest(core, places[is_unknown.numpy()], 1, workers=-1)
+    far = torch.zeros_like(is_unknown)
+    far[is_unknown] = from_numpy(distance[:, 0] > RIM * float(np.linalg.norm(high - low)))
     return votes + torch.stack([torch.zeros_like(share), far.to(share)], dim=1)
 
 

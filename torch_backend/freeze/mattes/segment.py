@@ -55,7 +55,7 @@ def segment_lasso(
     inside = filled(polygon, picture.shape[:2])
     slack = max(config.least, round(config.slack * picture.shape[1]))
     prior = config.prior / slack * signed_distance(inside)
-    return _cut(picture, depth, prior, ~_grown(inside, slack), config)
+    return _cut(picture, depth, prior, ~_dilated(inside, slack), config)
 
 
 def refine(
@@ -72,7 +72,7 @@ def refine(
         return np.zeros_like(rendered)
     band = max(2, round(config.band * picture.shape[1]))
     prior = np.where(is_known, config.prior / band * signed_distance(inside), -config.prior)
-    return _cut(picture, depth, prior, is_known & ~_grown(inside, band), config)
+    return _cut(picture, depth, prior, is_known & ~_dilated(inside, band), config)
 
 
 def signed_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -94,21 +94,21 @@ def filled(polygon: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.b
 
 
 def _cut(
-    picture: Picture, depth: NDArray[np.float32], prior: NDArray[np.float32], never: NDArray[np.bool_],
+    picture: Picture, depth: NDArray[np.float32], prior: NDArray[np.float32], excluded: NDArray[np.bool_],
     config: SegmentConfig,
 ) -> Matte:  # fmt: skip
-    """The matte from log-odds of outline, colour and depth (see the module docstring); 0 where `never` is True."""
+    """The matte from log-odds of outline, colour and depth (see the module docstring); 0 where `excluded` is True."""
     width = prior.shape[1]
-    rows, columns = _crop(~never, round(config.around * width))
+    rows, columns = _crop(~excluded, round(config.around * width))
     part, start = picture[rows, columns], prior[rows, columns]
     guide = part.astype(np.float32) / 255.0
     radius = max(1, round(config.radius * width))
-    away = np.log(np.maximum(depth[rows, columns], 1e-9))
-    inside = (start > 0.0) & ~never[rows, columns]
+    log_depth = np.log(np.maximum(depth[rows, columns], 1e-9))
+    inside = (start > 0.0) & ~excluded[rows, columns]
     odds = start + ratio(_colour_bins(part), COLOURS**3, inside, config.most)
-    odds += ratio(_depth_bins(away, inside), DEPTHS, inside, config.most)
+    odds += ratio(_depth_bins(log_depth, inside), DEPTHS, inside, config.most)
     odds = smoothed(guide, np.clip(odds, -2.0 * config.most, 2.0 * config.most), radius, config.epsilon)
-    hard = ((odds > 0.0) & ~never[rows, columns]).astype(np.float32)
+    hard = ((odds > 0.0) & ~excluded[rows, columns]).astype(np.float32)
     matte = np.zeros(prior.shape, np.float32)
     matte[rows, columns] = guided(guide, hard, radius, config.epsilon)
     return matte
@@ -124,11 +124,11 @@ def _colour_bins(picture: Picture) -> NDArray[np.int64]:
     return (lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2]
 
 
-def _depth_bins(away: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _depth_bins(log_depth: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     """[H, W] histogram bin of each pixel's log depth; the object's depths cover the middle half of the bins."""
-    low, high = np.quantile(away[inside], (0.02, 0.98)) if inside.any() else (0.0, 0.0)
+    low, high = np.quantile(log_depth[inside], (0.02, 0.98)) if inside.any() else (0.0, 0.0)
     span = max(float(high - low), 0.02)
-    return np.clip((away - low + 0.5 * span) / (2.0 * span) * DEPTHS, 0, DEPTHS - 1).astype(np.int64)
+    return np.clip((log_depth - low + 0.5 * span) / (2.0 * span) * DEPTHS, 0, DEPTHS - 1).astype(np.int64)
 
 
 def ratio(bins: NDArray[np.int64], count: int, inside: NDArray[np.bool_], most: float) -> NDArray[np.float32]:
@@ -187,5 +187,5 @@ def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
 
 
-def _grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+def _dilated(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), _disc(by))) > 0

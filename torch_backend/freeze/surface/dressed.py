@@ -98,8 +98,8 @@ def _confirmations(
 
 def _people(triangles: NDArray[np.int32], moves: NDArray[np.bool_], part: float) -> NDArray[np.bool_]:
     """bool [T]: True for triangles of people, from moving vertices `moves` [V]; small islands are removed."""
-    alike = moves[triangles].all(1) | ~moves[triangles].any(1)
-    size = _sizes(triangles[alike], len(moves))
+    is_uniform = moves[triangles].all(1) | ~moves[triangles].any(1)
+    size = _sizes(triangles[is_uniform], len(moves))
     is_surrounded = size < 0.5 * _sizes(triangles, len(moves))  # else it is most of a separate piece
     is_small = (size < 0.2 * part * len(triangles)) & is_surrounded
     return np.asarray((moves ^ is_small)[triangles].sum(1) >= 2)
@@ -151,11 +151,12 @@ def _looked_up(
         surface = view.depth_at(x, y, edge)
         centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         to_camera = (centre - vertices).astype(np.float32)
-        away = np.maximum(np.linalg.norm(to_camera, axis=1), 1e-20)
-        facing = np.maximum((to_camera * normals).sum(1) / away, 0.05)  # a normal is noise where the surface is thin
+        distance = np.maximum(np.linalg.norm(to_camera, axis=1), 1e-20)
+        # A normal is noise where the surface is thin.
+        facing = np.maximum((to_camera * normals).sum(1) / distance, 0.05)
         near = flat(np.where(surface > 0.0, np.exp(-np.square((surface - depth) / edge)), 0.0))[:, 0]
         # Pixels of the view per unit of surface area.
-        score = near * facing * np.square(view.K[0, 0] / away)
+        score = near * facing * np.square(view.K[0, 0] / distance)
         better = score > best
         best = np.where(better, score, best)
         colors[better] = flat(view.look(view.color, x, y))[better]

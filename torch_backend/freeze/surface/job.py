@@ -66,11 +66,11 @@ def make_surface(
         )
     key = file_digest(folder.facts)
     header = surface_of_take(folder)
-    is_made = header is None
+    is_new = header is None
     if header is None:
         surface = _fused(folder, config, report)
-        where = Similarity.of(placement_of(facts))
-        placed = where.points(surface.vertices).astype(np.float32)
+        transform = Similarity.of(placement_of(facts))
+        placed = transform.points(surface.vertices).astype(np.float32)
         header = SurfaceHeader(key, len(placed), len(surface.triangles))
         try:
             write_surface(folder.surface, header, placed, surface)
@@ -83,7 +83,7 @@ def make_surface(
         "vertices": header.vertices,
         "triangles": header.triangles,
         "people": people,
-        "made": is_made,
+        "made": is_new,
     }
 
 
@@ -110,11 +110,11 @@ def _fused(folder: TakeFolder, config: SurfaceConfig, report: Reporter) -> Surfa
     for view in views:
         view.depth[view.depth > far] = 0.0
 
-    def told(share: float) -> None:
+    def report_progress(share: float) -> None:
         report.progress("making the surface", round(len(chosen) * (1 + share)), 2 * len(chosen), "fusing depth")
         report.check_cancelled()
 
-    volume = fuse(views, config, progress=told)
+    volume = fuse(views, config, progress=report_progress)
     vertices, triangles = extract(volume)
     if not len(triangles):
         raise JobError("The frames of the take show no surface.", "Freeze more frames of it.", ExitCode.FREEZE)
@@ -134,8 +134,8 @@ def view_of(path: Path, config: SurfaceConfig) -> View:
     K[0, 2] += frame.margin[0]
     K[1, 2] += frame.margin[1]
 
-    def small(layer: NDArray[Any], how: int = cv2.INTER_AREA) -> NDArray[Any]:
-        return cv2.resize(layer, (w, h), interpolation=how)
+    def small(layer: NDArray[Any], method: int = cv2.INTER_AREA) -> NDArray[Any]:
+        return cv2.resize(layer, (w, h), interpolation=method)
 
     depth = small(frame.depth, cv2.INTER_NEAREST)
     sigma = frame.more.get("DepthSigma")  # takes of earlier versions lack it

@@ -36,13 +36,13 @@ def extract(volume: Volume) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     vertices = volume.space.back((cells + places / np.maximum(count, 1)[:, None]) * volume.voxel)
     found: list[NDArray[Any]] = []
     for axis in range(3):
-        along, one, other = (np.eye(3, dtype=np.int64)[(axis + n) % 3] for n in range(3))
+        along, second, third = (np.eye(3, dtype=np.int64)[(axis + n) % 3] for n in range(3))
         ends = values[:, 0], values[:, int(along @ (4, 2, 1))]
         rows = np.flatnonzero((ends[0] < 0) != (ends[1] < 0))
-        around = [_find(keys, cells[rows] - off) for off in (0 * one, one, one + other, other)]
+        around = [_find(keys, cells[rows] - offset) for offset in (0 * second, second, second + third, third)]
         quads = np.stack(around, 1)
-        is_whole = (quads >= 0).all(1)
-        quads, rises = quads[is_whole], (ends[0][rows] < 0)[is_whole]
+        is_complete = (quads >= 0).all(1)
+        quads, rises = quads[is_complete], (ends[0][rows] < 0)[is_complete]
         quads[~rises] = quads[~rises, ::-1]
         found += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
     return vertices.astype(np.float32), np.concatenate(found).astype(np.int32)
@@ -50,9 +50,9 @@ def extract(volume: Volume) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 
 def _find(keys: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Index of each cell [N, 3] in the ascending `keys`; -1 for missing cells."""
-    wanted = block_keys(cells)
-    at = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
-    return np.where(keys[at] == wanted, at, -1) if len(keys) else np.full(len(cells), -1)
+    targets = block_keys(cells)
+    at = np.minimum(np.searchsorted(keys, targets), max(len(keys) - 1, 0))
+    return np.where(keys[at] == targets, at, -1) if len(keys) else np.full(len(cells), -1)
 
 
 def _crossed(volume: Volume) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
@@ -62,13 +62,13 @@ def _crossed(volume: Volume) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     blocks = blocks_of(volume.keys)
     for first in range(0, len(blocks), 4096):
         part = blocks[first : first + 4096]
-        whole = np.full((len(part), *[SIDE + 1] * 3), np.nan, np.float32)  # plus the first voxels of the next blocks
+        padded = np.full((len(part), *[SIDE + 1] * 3), np.nan, np.float32)  # plus the first voxels of the next blocks
         for corner in _CORNERS:
             at = _find(volume.keys, part + corner)
             rows = np.flatnonzero(at >= 0)
             place, source = zip(*((SIDE, 0) if c else (slice(0, SIDE), slice(0, SIDE)) for c in corner), strict=True)
-            whole[(rows, *place)] = volume.distance[(at[rows], *source)]
-        shifted = [whole[(slice(None), *(slice(c, c + SIDE) for c in corner))] for corner in _CORNERS]
+            padded[(rows, *place)] = volume.distance[(at[rows], *source)]
+        shifted = [padded[(slice(None), *(slice(c, c + SIDE) for c in corner))] for corner in _CORNERS]
         below = sum((s < 0).astype(np.int8) for s in shifted)
         known = ~np.isnan(sum(shifted))
         found = np.nonzero(known & (below > 0) & (below < 8))

@@ -71,16 +71,16 @@ class View:
         """
         moved = points @ self.viewmat[:3, :3].T.astype(points.dtype) + self.viewmat[:3, 3].astype(points.dtype)
         depth = moved[..., 2]
-        is_ahead = depth > 0.0
-        safe_depth = np.where(is_ahead, depth, 1.0)
-        x = np.where(is_ahead, self.K[0, 0] * moved[..., 0] / safe_depth + (self.K[0, 2] - 0.5), -2.0)
-        y = np.where(is_ahead, self.K[1, 1] * moved[..., 1] / safe_depth + (self.K[1, 2] - 0.5), -2.0)
+        is_in_front = depth > 0.0
+        safe_depth = np.where(is_in_front, depth, 1.0)
+        x = np.where(is_in_front, self.K[0, 0] * moved[..., 0] / safe_depth + (self.K[0, 2] - 0.5), -2.0)
+        y = np.where(is_in_front, self.K[1, 1] * moved[..., 1] / safe_depth + (self.K[1, 2] - 0.5), -2.0)
         return x.astype(np.float32), y.astype(np.float32), depth.astype(np.float32)
 
     def look(self, picture: NDArray[Any], x: NDArray[Any], y: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
         """A picture of the view sampled at pixels [N, M], N below 32768; 0 outside of it."""
-        how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-        return cv2.remap(picture, x, y, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        return cv2.remap(picture, x, y, method, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
     def depth_at(self, x: NDArray[Any], y: NDArray[Any], edge: NDArray[Any]) -> NDArray[Any]:
         """[N, M] depth at pixels, 0 if unknown: interpolated on a surface, that of the nearest pixel at an edge.
@@ -104,8 +104,8 @@ class Contraction:
 
     def scale(self, points: NDArray[Any]) -> NDArray[Any]:
         """[...] size of voxels along the ray at points [..., 3], relative to voxels within the radius."""
-        off = points - self.centre.astype(points.dtype)
-        return np.maximum(np.sqrt((off * off).sum(-1)) / self.radius, 1.0).astype(points.dtype)
+        offset = points - self.centre.astype(points.dtype)
+        return np.maximum(np.sqrt((offset * offset).sum(-1)) / self.radius, 1.0).astype(points.dtype)
 
     def into(self, points: NDArray[Any]) -> NDArray[Any]:
         """Points [..., 3] in the contracted space."""
@@ -114,9 +114,9 @@ class Contraction:
 
     def back(self, points: NDArray[Any]) -> NDArray[Any]:
         """Inverse of `into`."""
-        off = points - self.centre
-        scale = np.exp(np.maximum(np.sqrt((off * off).sum(-1, keepdims=True)) / self.radius, 1.0) - 1.0)
-        return self.centre + off * (scale / (1.0 + np.log(scale)))
+        offset = points - self.centre
+        scale = np.exp(np.maximum(np.sqrt((offset * offset).sum(-1, keepdims=True)) / self.radius, 1.0) - 1.0)
+        return self.centre + offset * (scale / (1.0 + np.log(scale)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +201,8 @@ def fuse(
     return Volume(keys, distance.reshape(-1, SIDE, SIDE, SIDE), voxel, cut, space)
 
 
-def unprojected(view: View, off: NDArray[Any] | float = 0.0) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """(points [N, 3] of a view's pixels with depth, their rows, their columns); `off` [N] is added to the depth."""
+def unprojected(view: View, offset: NDArray[Any] | float = 0.0) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """(points [N, 3] of a view's pixels with depth, their rows, their columns); `offset` [N] is added to the depth."""
     rows, columns = np.nonzero(view.depth > 0)
     depth = view.depth[rows, columns].astype(np.float64)
     rays = np.stack(
@@ -213,7 +213,7 @@ def unprojected(view: View, off: NDArray[Any] | float = 0.0) -> tuple[NDArray[An
         ],
         -1,
     )
-    return (rays * (depth + off)[:, None] - view.viewmat[:3, 3]) @ view.viewmat[:3, :3], rows, columns
+    return (rays * (depth + offset)[:, None] - view.viewmat[:3, 3]) @ view.viewmat[:3, :3], rows, columns
 
 
 def _near_surfaces(views: Sequence[View], voxel: float, cut: float, space: Contraction) -> NDArray[np.int64]:
@@ -222,8 +222,8 @@ def _near_surfaces(views: Sequence[View], voxel: float, cut: float, space: Contr
     steps = np.linspace(-cut, cut, 1 + 2 * math.ceil(2 * cut / (SIDE * voxel)))  # steps of at most half a block
     for view in views:
         scale = space.scale(unprojected(view)[0])
-        for off in steps:
-            points = space.into(unprojected(view, off * scale)[0])
+        for offset in steps:
+            points = space.into(unprojected(view, offset * scale)[0])
             # Half a voxel is added, because the centres of a block's first voxels are on its border.
             found.append(np.unique(block_keys(np.floor((points / voxel + 0.5) / SIDE))))
     return np.unique(np.concatenate(found))
@@ -238,9 +238,9 @@ def _add(total: NDArray[Any], weight: NDArray[Any], view: View, points: NDArray[
         return
     x, y, depth, cuts = x[rows], y[rows], depth[rows], cuts[rows]
     surface = view.depth_at(x, y, cuts)
-    off = (surface - depth) / cuts
-    says = (surface > 0.0) & (off > -1.0)
+    distance = (surface - depth) / cuts
+    is_valid = (surface > 0.0) & (distance > -1.0)
     sigma = view.look(view.sigma, x, y, nearest=True)
-    trust = np.where(says, 1.0 / (1.0 + np.square(sigma / cuts)), 0.0).astype(np.float32)
-    total[rows] += trust * np.minimum(off, 1.0)
+    trust = np.where(is_valid, 1.0 / (1.0 + np.square(sigma / cuts)), 0.0).astype(np.float32)
+    total[rows] += trust * np.minimum(distance, 1.0)
     weight[rows] += trust

@@ -68,14 +68,14 @@ class DeepSamples:
         share[share < _LEAST] = 0.0
         share[share > 1.0 - _LEAST] = 1.0
         alpha = rgba[..., 3]
-        own = np.stack([share * alpha, (1.0 - share) * alpha / np.maximum(1.0 - share * alpha, 1e-8)])
-        own[1, share < 1.0] = np.where(alpha == 1.0, 1.0, own[1])[share < 1.0]  # exactly opaque, without rounding
+        alphas = np.stack([share * alpha, (1.0 - share) * alpha / np.maximum(1.0 - share * alpha, 1e-8)])
+        alphas[1, share < 1.0] = np.where(alpha == 1.0, 1.0, alphas[1])[share < 1.0]  # exactly opaque, without rounding
         colour = self.light[:, rows].numpy() / np.maximum(weight, 1e-8)[..., None]
         target = rgba[..., :3] / np.maximum(alpha, 1e-8)[..., None]
-        shown = share[..., None] * colour[0] + (1.0 - share[..., None]) * colour[1]
-        gain = np.maximum(target, 0.0) / np.maximum(shown, 1e-8)
-        colour = gain * colour + (target - gain * shown)  # offset for black splats and negative pixels
-        samples = np.concatenate([colour * own[..., None], own[..., None]], axis=-1)
+        mixed = share[..., None] * colour[0] + (1.0 - share[..., None]) * colour[1]
+        gain = np.maximum(target, 0.0) / np.maximum(mixed, 1e-8)
+        colour = gain * colour + (target - gain * mixed)  # offset for black splats and negative pixels
+        samples = np.concatenate([colour * alphas[..., None], alphas[..., None]], axis=-1)
         return samples.astype(np.float32), self.depth[:, rows].numpy()
 
 
@@ -100,7 +100,7 @@ def deep_samples(
     config, (height, width) = config or DeepConfig(), surface.shape
     between, depth = _surfaces(surface, config.step)
     weight, light = torch.zeros(2, height, width, device="cpu"), torch.zeros(2, height, width, 3, device="cpu")
-    left = torch.ones(height, width, device="cpu")
+    transmittance = torch.ones(height, width, device="cpu")
     viewmat = output.viewmat.to(frozen.support.device)
     z = frozen.state["means"] @ viewmat[2, :3] + viewmat[2, 3]
     for near, far in itertools.pairwise(_bounds(surface, config.slabs)):
@@ -109,10 +109,12 @@ def deep_samples(
             continue
         image = render_frozen(part, output.viewmat, K, width, height, exposure, exposed_at, beyond)
         at = (image.depth > between).long()[None]
-        shown = from_numpy(display.premultiplied_to_light(torch.cat([image.color, image.alpha[..., None]], 2).numpy()))
-        weight.scatter_add_(0, at, (left * image.alpha)[None])
-        light.scatter_add_(0, at[..., None].expand(1, height, width, 3), (left[..., None] * shown[..., :3])[None])
-        left *= 1.0 - image.alpha
+        rgba = from_numpy(display.premultiplied_to_light(torch.cat([image.color, image.alpha[..., None]], 2).numpy()))
+        weight.scatter_add_(0, at, (transmittance * image.alpha)[None])
+        light.scatter_add_(
+            0, at[..., None].expand(1, height, width, 3), (transmittance[..., None] * rgba[..., :3])[None]
+        )
+        transmittance *= 1.0 - image.alpha
     total = weight.sum(0)
     share = torch.where(total > 0.0, weight[0] / total.clamp_min(1e-8), 1.0)
     # A pixel with a single sample gets the frame's depth, although a neighbour is nearer or farther.

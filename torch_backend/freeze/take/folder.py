@@ -30,15 +30,15 @@ class Place:
     """The folder to which a take's frames are rendered, and the frames that are up to date."""
 
     folder: TakeFolder
-    """Folder for new frames: the take's own, or `beside`."""
-    beside: TakeFolder | None
+    """Folder for new frames: the take's own, or `replacement`."""
+    replacement: TakeFolder | None
     """Subfolder for new frames if the take's folder holds a complete take of other inputs. That take is kept until the
     new one is complete. None: new frames go to the take's own folder."""
-    right_here: set[int]
+    current: set[int]
     """Up-to-date frames in the take's own folder."""
-    right_beside: set[int]
-    """Up-to-date frames in `beside`, from an interrupted freeze."""
-    of_before: bool = False
+    replacement_current: set[int]
+    """Up-to-date frames in `replacement`, from an interrupted freeze."""
+    has_unkeyed: bool = False
     """True if there are frames of an earlier version, whose files have no keys; they are rendered again."""
 
 
@@ -50,24 +50,24 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
     folder, spec = take.folder, take.spec
     make_folders(folder, spec)
     keys = stored_keys(folder, spec) if params.only_missing else {}
-    right, next_folder, of_before = right_frames(take, keys), folder.next, "" in keys.values()
-    right_in_next = set[int]()
+    current, next_folder, has_unkeyed = current_frames(take, keys), folder.next, "" in keys.values()
+    current_in_next = set[int]()
     if params.only_missing and next_folder.root.is_dir():
-        right_in_next = right_frames(take, stored_keys(next_folder, spec))
-    for n in set(_numbers(next_folder)) - right_in_next:
+        current_in_next = current_frames(take, stored_keys(next_folder, spec))
+    for n in set(_numbers(next_folder)) - current_in_next:
         for file in files_of(next_folder, n):
             remove_file(file)
-    stands = folder.facts.is_file() and bool(set(frames_of(folder)) - right)
-    if not stands:
-        place = Place(folder, next_folder, right, right_in_next)
+    has_earlier_take = folder.facts.is_file() and bool(set(frames_of(folder)) - current)
+    if not has_earlier_take:
+        place = Place(folder, next_folder, current, current_in_next)
         if next_folder.root.is_dir():  # the last freeze was killed in `take_over`
             take_over(take, place)
-        return Place(folder, None, right | right_in_next, set(), of_before)
+        return Place(folder, None, current | current_in_next, set(), has_unkeyed)
     _prepare(next_folder, spec)
-    return Place(next_folder, next_folder, right, right_in_next, of_before)
+    return Place(next_folder, next_folder, current, current_in_next, has_unkeyed)
 
 
-def right_frames(take: PlannedTake, keys: dict[int, str | None]) -> set[int]:
+def current_frames(take: PlannedTake, keys: dict[int, str | None]) -> set[int]:
     """The up-to-date frames, given `keys` from `stored_keys`."""
     return {n for n, key in keys.items() if key is not None and key == take.keys.get(n)}
 
@@ -93,7 +93,7 @@ def stored_key(folder: TakeFolder, frame: int, spec: FrameSpec) -> str | None:
     return "" if "" in keys else keys.pop() if len(keys) == 1 else None
 
 
-def made_before(take: str) -> tuple[str, str]:
+def unkeyed_warning(take: str) -> tuple[str, str]:
     """(warning, hint) about a take with frames of an earlier version."""
     return (
         f"Frames of the take {take} were made by an earlier version, whose files do not say which belong together: "
@@ -107,12 +107,12 @@ def outdated(take: PlannedTake, kept: Set[int]) -> tuple[str, str] | None:
 
     None if there are no such frames.
     """
-    gone = set(frames_of(take.folder)) - kept
-    if not gone:
+    removed = set(frames_of(take.folder)) - kept
+    if not removed:
         return None
     return (
         f"Frames of the take {take.folder.root.name} that show another instant or have other settings are removed and "
-        f"not rendered again: {len(gone)}.",
+        f"not rendered again: {len(removed)}.",
         "Freeze the whole range to have them again, or name another take to keep them.",
     )
 
@@ -127,14 +127,16 @@ def clear(take: PlannedTake, done: Set[int]) -> None:
 
 
 def take_over(take: PlannedTake, place: Place) -> None:
-    """Replaces an earlier take by the frames rendered to `place.beside`. After a kill, the next freeze continues."""
-    assert place.beside is not None
-    clear(take, place.right_here)
-    for n in frames_of(place.beside):
-        for file, target in zip(reversed(files_of(place.beside, n)), reversed(files_of(take.folder, n)), strict=True):
+    """Replaces an earlier take by the frames in `place.replacement`. After a kill, the next freeze continues."""
+    assert place.replacement is not None
+    clear(take, place.current)
+    for n in frames_of(place.replacement):
+        for file, target in zip(
+            reversed(files_of(place.replacement, n)), reversed(files_of(take.folder, n)), strict=True
+        ):
             if file.is_file():  # the EXR is moved last: if it exists, so do the other files
                 replace_file(file, target)
-    shutil.rmtree(place.beside.root, ignore_errors=True)
+    shutil.rmtree(place.replacement.root, ignore_errors=True)
 
 
 def files_of(folder: TakeFolder, frame: int) -> list[Path]:
@@ -169,7 +171,7 @@ def frames_of(folder: TakeFolder) -> list[int]:
 def _numbers(folder: TakeFolder) -> list[int]:
     """Numbers of all frames of which any file exists, ascending."""
     folders = folder.root, folder.warps, folder.deeps
-    files = [folder.previews.glob("*" + PICTURE), *(each.glob("*" + LAYERS) for each in folders)]
+    files = [folder.previews.glob("*" + PICTURE), *(inner.glob("*" + LAYERS) for inner in folders)]
     return sorted({n for found in files for n in _frames_in(found)})
 
 

@@ -39,7 +39,7 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     shift = recorded_shift(load_frames(shot))
     facts = {
         "file": os.path.abspath(info.file),
-        "beside": _beside(shot.root, info.file),
+        "beside": _relative_path(shot.root, info.file),
         "size": [info.width, info.height],
         "first": info.first - shift,
         "last": None if info.last is None else info.last - shift,
@@ -67,11 +67,11 @@ def footage_light(shot: Shot) -> str:
 def _unsteady(shot: Shot, fps: float) -> str:
     """Reason why programs that seek by time would show other frames; empty for a constant frame rate."""
     rows = load_frames(shot)["frames"]
-    off = [float(row["seconds"]) - (int(row["frame"]) - int(rows[0]["frame"])) / fps for row in rows]
-    return "its rate varies" if max(off) - min(off) > 0.5 / fps else ""
+    drift = [float(row["seconds"]) - (int(row["frame"]) - int(rows[0]["frame"])) / fps for row in rows]
+    return "its rate varies" if max(drift) - min(drift) > 0.5 / fps else ""
 
 
-def _beside(root: Path, file: str) -> str:
+def _relative_path(root: Path, file: str) -> str:
     try:
         return Path(os.path.relpath(file, root)).as_posix()
     except ValueError:  # another drive on Windows

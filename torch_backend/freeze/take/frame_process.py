@@ -82,9 +82,9 @@ def _render(request: dict[str, Any], stream: BinaryIO) -> None:
     take = planned(shot, params, report, request["t_star"])
     if take.all_keys != request["keys"]:
         return
-    wanted = set(request["frames"])
+    requested = set(request["frames"])
     take = dataclasses.replace(take, folder=TakeFolder(shot.own(Path(request["folder"]))))
-    frames = [output for output in take.whole if output.frame in wanted]
+    frames = [output for output in take.whole if output.frame in requested]
     for frame, share in render_frames(take, frames, set(), report).items():
         header = {"kind": "share", "frame": frame, "size": list(share.shape)}
         write_message(stream, header, share.contiguous().numpy().tobytes())

@@ -27,20 +27,20 @@ from ..composite.grain import Brush, Grain
 from ..composite.transfer import to_display
 from ..composite.warp import WarpMetadata, write_warp
 from ..deep_exr import write_deep_exr
-from ..exr import DetailLayers, FrameMetadata, Made, write_frozen_exr
+from ..exr import DetailLayers, FrameMetadata, LazyLayer, write_frozen_exr
 from ..frozen import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
 from ..views.reproject import resized
+from .background_writer import BackgroundWriter
 from .debug_terms import origin_terms, write_terms
 from .deep import DeepSamples, deep_samples
 from .motion_blur import MotionBlur, kept_grain
 from .plan import FrameSpec, PlannedTake
-from .write_beside import WriteBeside
 
 
 def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> None:
     """Develops the instants of the `frames` that are not in `done`. JobError if the disk has no room for the frames."""
     spec, missing = take.spec, [f for f in frames if f.frame not in done]
-    each = (
+    bytes_per_frame = (
         spec.whole[0]
         * spec.whole[1]
         * (
@@ -51,7 +51,7 @@ def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], rep
             + (14.0 if spec.deep else 0.0)
         )
     )
-    need_disk(take.folder.root, len(missing) * each, "the take")
+    need_disk(take.folder.root, len(missing) * bytes_per_frame, "the take")
     spec.instants.prepare((f.t_star for f in missing), report)
 
 
@@ -78,7 +78,7 @@ def _render_all(
     folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
     done = done if spec.debug_terms is None else set()  # debug terms of existing frames are not stored
     shares: dict[int, Tensor] = {}
-    with WriteBeside() as out:
+    with BackgroundWriter() as out:
         for n, output in enumerate(frames):
             report.check_cancelled()
             report.progress("freezing", n, len(frames), f"frame {output.frame}")
@@ -101,16 +101,16 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
     """A frame of the take, from splats or plates. With motion blur, only colour and alpha are blurred."""
     frozen = spec.instants.at(output.t_star, report)
     K = whole_camera(output, spec)
-    image, made = _composited(output, frozen, scene, spec)
-    if spec.debug_terms is not None and isinstance(made, CompositeFrame):
-        h, w = made.terms["motion"].shape
-        made.terms |= origin_terms(frozen, output.viewmat, K, spec.whole, spec.beyond, (w, h))
-    picture = _display(made, slice(None)) + (1.0 - made.alpha[..., None]) * 0.5
+    image, frame = _composited(output, frozen, scene, spec)
+    if spec.debug_terms is not None and isinstance(frame, CompositeFrame):
+        h, w = frame.terms["motion"].shape
+        frame.terms |= origin_terms(frozen, output.viewmat, K, spec.whole, spec.beyond, (w, h))
+    picture = _display(frame, slice(None)) + (1.0 - frame.alpha[..., None]) * 0.5
     measured = spec.measured.at(output.t_star, frozen)
-    made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture, measured)
+    frame.depth, frame.depth_sigma = spec.depths.of(output.viewmat, K, frame.depth, image.motion, picture, measured)
     if spec.blur is not None:
-        _blur(made, spec.blur.beside_middle(output, K, made.depth), frozen, scene, spec, report)
-    return made
+        _blur(frame, spec.blur.sample_cameras(output, K, frame.depth), frozen, scene, spec, report)
+    return frame
 
 
 def _composited(
@@ -123,23 +123,23 @@ def _composited(
 
 
 def _blur(
-    made: FrozenImage | CompositeFrame, cameras: list[OutputFrame], frozen: FrozenGaussians, scene: Scene,
+    frame: FrozenImage | CompositeFrame, cameras: list[OutputFrame], frozen: FrozenGaussians, scene: Scene,
     spec: FrameSpec, report: Reporter,
 ) -> None:  # fmt: skip
     """Replaces colours and alphas of a frame with the scene-linear mean of its own and those of other `cameras`."""
     if not cameras:
         return
-    sums = _lights(made, scene.display)
+    sums = _lights(frame, scene.display)
     for camera in cameras:
         report.check_cancelled()
-        for total, one in zip(sums, _lights(_composited(camera, frozen, scene, spec)[1], scene.display), strict=True):
-            total += one
+        for total, light in zip(sums, _lights(_composited(camera, frozen, scene, spec)[1], scene.display), strict=True):
+            total += light
     means = [total / (len(cameras) + 1) for total in sums]
-    if isinstance(made, CompositeFrame):
-        made.linear, made.alpha = means[0][..., :3], means[0][..., 3]
-        made.splat, made.splat_alpha = _shown(means[1], scene.display), means[1][..., 3]
+    if isinstance(frame, CompositeFrame):
+        frame.linear, frame.alpha = means[0][..., :3], means[0][..., 3]
+        frame.splat, frame.splat_alpha = _from_light(means[1], scene.display), means[1][..., 3]
     else:
-        made.color, made.alpha = _shown(means[0], scene.display), means[0][..., 3]
+        frame.color, frame.alpha = _from_light(means[0], scene.display), means[0][..., 3]
 
 
 def _lights(image: FrozenImage | CompositeFrame, display: Display) -> list[Tensor]:
@@ -150,7 +150,7 @@ def _lights(image: FrozenImage | CompositeFrame, display: Display) -> list[Tenso
     return [from_numpy(scene_linear(image.color.numpy(), image.alpha.numpy(), display))]
 
 
-def _shown(light: Tensor, display: Display) -> Tensor:
+def _from_light(light: Tensor, display: Display) -> Tensor:
     """[H, W, 3] premultiplied, display-referred, from scene-linear [H, W, 4]: the inverse of `scene_linear`."""
     alpha = light[..., 3:]
     straight = torch.where(alpha > 0.0, light[..., :3] / alpha.clamp_min(1e-8), 0.0)
@@ -203,17 +203,17 @@ def _write_frame(
     layers = None
     if isinstance(image, CompositeFrame):
         splat, covered = image.splat.numpy(), image.splat_alpha.numpy()
-        shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows], scene.display))
-        layers = DetailLayers(shown, image.plate, image.source)
-    more: dict[str, NDArray[np.float32] | Made] = {}
+        splat_layer = LazyLayer((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows], scene.display))
+        layers = DetailLayers(splat_layer, image.plate, image.source)
+    more: dict[str, NDArray[np.float32] | LazyLayer] = {}
     if image.depth_sigma is not None:
         more["DepthSigma"] = (image.depth_sigma / scene.scale).numpy()
     if spec.passes is not None:
         more |= spec.passes.of(output, whole_camera(output, spec), image.depth)
     write_frozen_exr(
         folder.frame(output.frame),
-        Made((*size, 4), functools.partial(_rgba, image, scene)),
-        Made(size, depth),
+        LazyLayer((*size, 4), functools.partial(_rgba, image, scene)),
+        LazyLayer(size, depth),
         image.support.numpy(),
         image.motion.numpy(),
         FrameMetadata(
@@ -283,28 +283,28 @@ def _solve_viewmat(output: OutputFrame, scene: Scene) -> Tensor:
 
 def _grain(
     grain: Grain, output: OutputFrame, image: FrozenImage | CompositeFrame, spec: FrameSpec, display: Display
-) -> Made:  # fmt: skip
+) -> LazyLayer:  # fmt: skip
     """The grain layer of a frame, [H, W, 3] scene-linear, premultiplied. Grain is measured on sRGB, so colours of other
     displays are converted first."""
     brush = Brush(grain, output.frame, image.alpha.shape, spec.whole_grain_size)
     K, softness = whole_camera(output, spec), grain.softness * spec.whole[0] / spec.whole_grain_size[0]
     blur: MotionBlur | None = None if spec.blur is None or spec.blur.is_still(output) else spec.blur
 
-    def drawn(rows: slice) -> np.ndarray:
+    def layer_rows(rows: slice) -> np.ndarray:
         colour = to_display(image.linear[rows], PLAIN) if isinstance(image, CompositeFrame) else image.color[rows]
-        shown = torch.cat([colour, image.alpha[rows][..., None]], dim=2).numpy()
+        rgba = torch.cat([colour, image.alpha[rows][..., None]], dim=2).numpy()
         if display.bends and not isinstance(image, CompositeFrame):
-            shown = on_straight_colour(shown, lambda x: display.straightened(np.asarray(x, np.float32)))
-        made = brush.rows(rows, shown)
+            rgba = on_straight_colour(rgba, lambda x: display.straightened(np.asarray(x, np.float32)))
+        noise = brush.rows(rows, rgba)
         if isinstance(image, CompositeFrame):  # plates already have grain
             lacking = 1.0 - image.plate[rows]
             if blur is not None:  # motion blur averages part of the plates' grain away; variances add up
                 lengths = blur.lengths(output, K, image.depth[rows], rows.start)
                 lacking = (1.0 - kept_grain(lengths, softness).float() * (1.0 - lacking.square())).sqrt()
-            made = made * lacking.numpy()[..., None]
-        return made
+            noise = noise * lacking.numpy()[..., None]
+        return noise
 
-    return Made((*image.alpha.shape, 3), drawn)
+    return LazyLayer((*image.alpha.shape, 3), layer_rows)
 
 
 def _display(image: FrozenImage | CompositeFrame, rows: slice) -> Tensor:
@@ -318,22 +318,22 @@ def _preview(image: FrozenImage | CompositeFrame, spec: FrameSpec) -> np.ndarray
     out = np.empty((height, width, 3), np.uint8)
     for part in bands(height, width):
         rows = slice(part.start + top, part.stop + top)
-        shown = _display(image, rows) + (1.0 - image.alpha[rows][..., None]) * 0.5
-        shown = shown[:, left : left + width].clamp(0.0, 1.0) * 255.0 + 0.5
-        out[part] = shown.to(torch.uint8).numpy()
+        pixels = _display(image, rows) + (1.0 - image.alpha[rows][..., None]) * 0.5
+        pixels = pixels[:, left : left + width].clamp(0.0, 1.0) * 255.0 + 0.5
+        out[part] = pixels.to(torch.uint8).numpy()
     return out
 
 
-def _write_warp(folder: TakeFolder, output: OutputFrame, made: CompositeFrame, spec: FrameSpec, key: str) -> None:
+def _write_warp(folder: TakeFolder, output: OutputFrame, frame: CompositeFrame, spec: FrameSpec, key: str) -> None:
     assert spec.detail is not None
     plates = spec.detail.plates
     write_warp(
         folder.warp(output.frame),
-        made.st,
-        made.matte,
-        made.fill,
-        made.alpha,
-        WarpMetadata(output.frame, made.primary, output.t_star, plates.width, plates.height, key, light=spec.light),
+        frame.st,
+        frame.matte,
+        frame.fill,
+        frame.alpha,
+        WarpMetadata(output.frame, frame.primary, output.t_star, plates.width, plates.height, key, light=spec.light),
         spec.beyond,
     )
 

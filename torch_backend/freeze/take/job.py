@@ -31,7 +31,7 @@ from ..exr import read_frozen_exr
 from ..frozen import OutputFrame
 from .cameras import in_range, intrinsics
 from .contact_sheet import write_contact_sheet
-from .folder import clear, made_before, outdated, place_of, take_over
+from .folder import clear, outdated, place_of, take_over, unkeyed_warning
 from .footage_facts import footage_facts
 from .frames import make_ready, small_share
 from .plan import FrameSpec, PlannedTake, planned, run_verdict
@@ -49,16 +49,16 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     take = planned(shot, params, report)
     frames = in_range(take.whole, params)
     place = place_of(take, params)
-    if place.of_before:
-        report.warning(*made_before(params.take))
-    if (warning := outdated(take, place.right_here | {f.frame for f in frames})) is not None:
+    if place.has_unkeyed:
+        report.warning(*unkeyed_warning(params.take))
+    if (warning := outdated(take, place.current | {f.frame for f in frames})) is not None:
         report.warning(*warning)
-    done = place.right_here | place.right_beside
+    done = place.current | place.replacement_current
     make_ready(take, frames, done, report)  # may fail or be cancelled, so it runs before old frames are removed
-    if place.beside is None:
+    if place.replacement is None:
         clear(take, done)
     shares = render_side_by_side(shot, params, dataclasses.replace(take, folder=place.folder), frames, done, report)
-    if place.beside is not None:
+    if place.replacement is not None:
         take_over(take, place)
     frames_on_disk = done | {f.frame for f in frames}
     facts = finish(shot, params, take, [f for f in take.whole if f.frame in frames_on_disk], shares, report)
@@ -93,9 +93,9 @@ def _finish(
     numbers = [f.frame for f in frames]
     report.progress("finishing the take", 0, 3, "contact sheet")
     previews = [folder.preview(n) for n in numbers]
-    made_of = _made_of(folder, numbers, spec, shares)
+    detail_record = _detail_record(folder, numbers, spec, shares)
     inputs = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
-    verdict = judge_take({"t_star_frame": t_star, **inputs, "detail": made_of.get("detail")}, run_verdict(run))
+    verdict = judge_take({"t_star_frame": t_star, **inputs, "detail": detail_record.get("detail")}, run_verdict(run))
     info = shot.info()
     title = f"{info.name}, {Path(info.source).name}: t* = frame {t_star}, run {params.run}"
     with missable("contact sheet", report):
@@ -122,7 +122,7 @@ def _finish(
         "redistort": str(redistort or ""),
         "usd": str(folder.usd) if folder.usd.is_file() else "",
         "placement": placement.to_json(),
-        **made_of,
+        **detail_record,
         **({} if verdict is None else {"verdict": vars(verdict)}),
     }
     write_json(folder.facts, facts)
@@ -166,7 +166,7 @@ def _facts(shot: Shot, params: FreezeParams, take: PlannedTake) -> dict[str, Any
 
 
 @contextlib.contextmanager
-def missable(what: str, report: Reporter) -> Generator[None]:
+def missable(name: str, report: Reporter) -> Generator[None]:
     """Context manager that turns an OSError of writing an optional file into a warning.
 
     On Windows, a file that a player has open cannot be replaced. A full disk and unknown errors are raised.
@@ -177,10 +177,12 @@ def missable(what: str, report: Reporter) -> Generator[None]:
         known = None if is_disk_full(error) else path_error(error)
         if known is None:
             raise
-        report.warning(f"The {what} is not written: {known.message}", "The frames are. Close it, then freeze again.")
+        report.warning(f"The {name} is not written: {known.message}", "The frames are. Close it, then freeze again.")
 
 
-def _made_of(folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]) -> dict[str, Any]:
+def _detail_record(
+    folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]
+) -> dict[str, Any]:
     """Facts on plate detail for take.json; {} without plate detail. `shares` are those of the rendered frames."""
     if spec.detail is None:
         return {}
@@ -217,14 +219,14 @@ def _contact_sheet(
     verdict: Verdict | None,
 ) -> None:  # fmt: skip
     seen = [i for i, n in enumerate(numbers) if shot.plate(n).is_file()]  # frames missing in the footage have no plate
-    own_poses = not params.camera_path and bool(seen)
-    if own_poses:
+    on_clip_poses = not params.camera_path and bool(seen)
+    if on_clip_poses:
         previews, numbers = [previews[i] for i in seen], [numbers[i] for i in seen]
     plates = [shot.plate(n) for n in numbers]
     path = TakeFolder(shot.take(params.take)).contact_sheet
     note, doubt = ("", set[int]()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
     write_contact_sheet(
-        path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt
+        path, plates if on_clip_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt
     )
 
 

@@ -57,28 +57,32 @@ class MotionBlur:
 
     def facts(self, output: OutputFrame) -> list[Any]:
         """Inputs of a frame's blur for its key, in addition to the inputs of its picture."""
-        near = [(each.frame, floats(each.viewmat.flatten()), floats(each.K.flatten())) for each in self._beside(output)]
+        near = [
+            (frame.frame, floats(frame.viewmat.flatten()), floats(frame.K.flatten()))
+            for frame in self._adjacent(output)
+        ]
         return [self.shutter, dataclasses.asdict(self.config), near]
 
     def at(self, output: OutputFrame, share: float) -> OutputFrame:
         """A frame's camera at a share of the shutter's interval: -0.5 when it opens, 0.5 when it closes."""
         offset = share * self.shutter / 360.0
-        near = self._beside(output)
-        if not offset or not near:
+        neighbours = self._adjacent(output)
+        if not offset or not neighbours:
             return output
-        other = near[-1] if offset > 0.0 else near[0]
-        way = offset / (other.frame - output.frame)  # negative at the ends of the path: extrapolates
+        neighbour = neighbours[-1] if offset > 0.0 else neighbours[0]
+        way = offset / (neighbour.frame - output.frame)  # negative at the ends of the path: extrapolates
         viewmat = np.eye(4)
-        viewmat[:3] = interpolate_pose(output.viewmat.numpy(), other.viewmat.numpy(), way)
-        return replace(output, viewmat=from_numpy(viewmat).float(), K=output.K + way * (other.K - output.K))
+        viewmat[:3] = interpolate_pose(output.viewmat.numpy(), neighbour.viewmat.numpy(), way)
+        return replace(output, viewmat=from_numpy(viewmat).float(), K=output.K + way * (neighbour.K - output.K))
 
     def is_still(self, output: OutputFrame) -> bool:
         """True if the camera does not move while the shutter is open for a frame."""
         return not any(
-            bool((each.viewmat != output.viewmat).any() or (each.K != output.K).any()) for each in self._beside(output)
+            bool((frame.viewmat != output.viewmat).any() or (frame.K != output.K).any())
+            for frame in self._adjacent(output)
         )
 
-    def beside_middle(self, output: OutputFrame, K: Tensor, depth: Tensor) -> list[OutputFrame]:
+    def sample_cameras(self, output: OutputFrame, K: Tensor, depth: Tensor) -> list[OutputFrame]:
         """The cameras to composite in addition to a frame's own, evenly spaced in time; empty without visible motion.
 
         Args:
@@ -121,14 +125,14 @@ class MotionBlur:
             total += torch.where(solid & (seen_depth > 1e-6), way, 0.0)
         return total
 
-    def _beside(self, output: OutputFrame) -> list[OutputFrame]:
+    def _adjacent(self, output: OutputFrame) -> list[OutputFrame]:
         """The previous and the next frame of the path, if they exist."""
         at = self._places[output.frame]
         return [self.frames[n] for n in (at - 1, at + 1) if 0 <= n < len(self.frames)]
 
     @functools.cached_property
     def _places(self) -> dict[int, int]:
-        return {each.frame: n for n, each in enumerate(self.frames)}
+        return {frame.frame: n for n, frame in enumerate(self.frames)}
 
 
 def kept_grain(lengths: Tensor, softness: float) -> Tensor:

@@ -25,7 +25,16 @@ from ...contract import (
 from ...shot import Shot, write_json
 from ..frozen import OutputFrame
 from .cameras import in_range
-from .folder import files_of, frames_of, made_before, make_folders, outdated, right_frames, stored_key, stored_keys
+from .folder import (
+    current_frames,
+    files_of,
+    frames_of,
+    make_folders,
+    outdated,
+    stored_key,
+    stored_keys,
+    unkeyed_warning,
+)
 from .frames import render_frames
 from .job import finish
 from .plan import PlannedTake, planned
@@ -43,8 +52,8 @@ def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, A
     chosen = in_range(take.whole, params)
     keys = stored_keys(take.folder, take.spec)
     if "" in keys.values():
-        report.warning(*made_before(params.take))
-    if set(keys) - right_frames(take, keys):
+        report.warning(*unkeyed_warning(params.take))
+    if set(keys) - current_frames(take, keys):
         remove_file(take.folder.facts)  # its frames will be replaced one by one
     state = {"version": 1, "key": take.key, "t_star": take.t_star, "frames": take.all_keys}
     write_json(take.folder.state, state)
@@ -63,7 +72,7 @@ def freeze_part(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
         frames = in_range(take.whole, params)
     except JobError:
         frames = []
-    done = _right_of(take, frames)
+    done = _current_of(take, frames)
     render_frames(take, frames, done, report, lambda: _refuse_opened_anew(take))
     if take.spec.run.stale:
         raise JobError(
@@ -78,28 +87,28 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     Outdated frames are removed. Returns the content of take.json. JobError names the first missing frame.
     """
     take = _opened(shot, params, report)
-    wanted = in_range(take.whole, params)
-    right = _right_of(take, take.whole)
-    lacking = [f.frame for f in wanted if f.frame not in right]
+    requested = in_range(take.whole, params)
+    current = _current_of(take, take.whole)
+    lacking = [f.frame for f in requested if f.frame not in current]
     if lacking:
         raise JobError(
-            f"Take {params.take} of {shot.root.name} lacks {len(lacking)} of {len(wanted)} frames, the first is "
+            f"Take {params.take} of {shot.root.name} lacks {len(lacking)} of {len(requested)} frames, the first is "
             f"{lacking[0]}.",
             "Run the part that it belongs to again.",
             ExitCode.FREEZE,
         )
-    if (warning := outdated(take, right)) is not None:
+    if (warning := outdated(take, current)) is not None:
         report.warning(*warning)
     for number in frames_of(take.folder):
-        if number not in right:
+        if number not in current:
             for old in files_of(take.folder, number):
                 remove_file(old)
-    return finish(shot, params, take, [f for f in take.whole if f.frame in right], {}, report)
+    return finish(shot, params, take, [f for f in take.whole if f.frame in current], {}, report)
 
 
-def _right_of(take: PlannedTake, frames: list[OutputFrame]) -> set[int]:
+def _current_of(take: PlannedTake, frames: list[OutputFrame]) -> set[int]:
     """Numbers of the given frames whose files on disk are up to date."""
-    return right_frames(take, {f.frame: stored_key(take.folder, f.frame, take.spec) for f in frames})
+    return current_frames(take, {f.frame: stored_key(take.folder, f.frame, take.spec) for f in frames})
 
 
 def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
@@ -138,7 +147,7 @@ def _refuse_opened_anew(take: PlannedTake) -> None:
 
 def _refuse_undeveloped(take: PlannedTake) -> None:
     """Raises JobError if an instant is not stored in the run's folder: instants developed per part would not match."""
-    lacking = [int(t) for t in take.spec.instants.keys if not take.spec.instants.is_kept(t)]
+    lacking = [int(t) for t in take.spec.instants.keys if not take.spec.instants.is_stored(t)]
     if lacking:
         raise JobError(
             f"The developed instant {lacking[0]} is not kept with the run.",

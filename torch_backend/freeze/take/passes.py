@@ -19,7 +19,7 @@ from ...cameras.placement import Similarity
 from ...contract import NO_DEPTH
 from ...scene import Scene
 from ...torch_types import floats
-from ..exr import Made
+from ..exr import LazyLayer
 from ..frozen import OutputFrame
 
 Array = NDArray[np.float64]
@@ -43,10 +43,10 @@ class Passes:
 
     def facts(self, output: OutputFrame) -> list[Any]:
         """Inputs of a frame's passes for its key, in addition to the inputs of its picture."""
-        near = [floats(each.viewmat.flatten()) for each in self._beside(output) if each is not None]
+        near = [floats(frame.viewmat.flatten()) for frame in self._adjacent(output) if frame is not None]
         return [self.to_scene.matrix.flatten().tolist(), near]
 
-    def of(self, output: OutputFrame, K: Tensor, depth: Tensor) -> dict[str, Made]:
+    def of(self, output: OutputFrame, K: Tensor, depth: Tensor) -> dict[str, LazyLayer]:
         """The layers of a frame by name, computed some rows at a time.
 
         Args:
@@ -76,8 +76,8 @@ class Passes:
         def moved(rows: slice) -> NDArray[np.float32]:
             return moves(rows.start, rows.stop)
 
-        def layer(channels: int, rows: Callable[[slice], NDArray[np.float32]]) -> Made:
-            return Made((height, width, channels), rows)
+        def layer(channels: int, rows: Callable[[slice], NDArray[np.float32]]) -> LazyLayer:
+            return LazyLayer((height, width, channels), rows)
 
         return {
             "Vector": layer(4, lambda rows: moved(rows) * _VECTOR_SIGNS),
@@ -87,9 +87,9 @@ class Passes:
             "Position": layer(3, lambda rows: self._positions(*seen(rows))),
         }
 
-    def _beside(self, output: OutputFrame) -> tuple[OutputFrame | None, OutputFrame | None]:
+    def _adjacent(self, output: OutputFrame) -> tuple[OutputFrame | None, OutputFrame | None]:
         """(previous, next) frame of the take; None if missing."""
-        at = {each.frame: each for each in self.frames}
+        at = {frame.frame: frame for frame in self.frames}
         return at.get(output.frame - 1), at.get(output.frame + 1)
 
     def _positions(self, points: Array, is_solid: Mask) -> NDArray[np.float32]:
@@ -100,9 +100,9 @@ class Passes:
         self, seen: Callable[[slice], tuple[Array, Mask]], rows: slice, height: int
     ) -> NDArray[np.float32]:  # fmt: skip
         """[h, W, 3] normals from the nearer horizontal and vertical neighbour of each point, to ignore depth steps."""
-        wide = slice(max(0, rows.start - 1), min(height, rows.stop + 1))
-        inner = slice(rows.start - wide.start, rows.stop - wide.start)
-        points, is_solid = seen(wide)
+        padded = slice(max(0, rows.start - 1), min(height, rows.stop + 1))
+        inner = slice(rows.start - padded.start, rows.stop - padded.start)
+        points, is_solid = seen(padded)
         normals = np.cross(_slope(points, is_solid, 0), _slope(points, is_solid, 1))[inner]
         lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
         has_normal = is_solid[inner][..., None] & (lengths > 0.0)
@@ -115,19 +115,19 @@ class Passes:
         """[h, w, 4] image motion in pixels, x right and y up: to the previous frame, then to the next frame."""
         found = np.zeros((*is_solid.shape, 4), np.float32)
         x, y = _centres(is_solid.shape, top)
-        for at, other in zip((0, 2), self._beside(output), strict=True):
-            if other is None:
+        for at, neighbour in zip((0, 2), self._adjacent(output), strict=True):
+            if neighbour is None:
                 continue
-            its_lens = other.K.double().numpy().copy()
+            its_lens = neighbour.K.double().numpy().copy()
             its_lens[:2, 2] += (lens - output.K.double().numpy())[:2, 2]  # the same overscan as this frame
-            viewmat = other.viewmat.double().numpy()
+            viewmat = neighbour.viewmat.double().numpy()
             local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-            is_ahead = is_solid & (local[..., 2] > _NEAREST)
-            safe_z = np.where(is_ahead, local[..., 2], 1.0)
+            is_in_front = is_solid & (local[..., 2] > _NEAREST)
+            safe_z = np.where(is_in_front, local[..., 2], 1.0)
             across = its_lens[0, 0] * local[..., 0] / safe_z + its_lens[0, 2] - x
             down = its_lens[1, 1] * local[..., 1] / safe_z + its_lens[1, 2] - y
-            found[..., at] = np.where(is_ahead, across, 0.0)
-            found[..., at + 1] = np.where(is_ahead, -down, 0.0)
+            found[..., at] = np.where(is_in_front, across, 0.0)
+            found[..., at + 1] = np.where(is_in_front, -down, 0.0)
         return found
 
 

@@ -34,7 +34,7 @@ from ...contract import (
 from ...native import cores
 from ...shot import Shot
 from ..frozen import OutputFrame
-from .folder import right_frames, stored_key
+from .folder import current_frames, stored_key
 from .frames import make_ready, render_frames
 from .plan import PlannedTake
 
@@ -71,8 +71,8 @@ def render_side_by_side(
     if processes is None:
         free_bytes = (memory() or (0.0, 0.0))[1]
         processes = processes_for(len(missing), spec.whole[0] * spec.whole[1], cores(), free_bytes)
-    kept = all(spec.instants.is_kept(t) for t in spec.instants.keys)
-    if processes < 2 or not kept or spec.run.stale or spec.run.model.gaussians.open.is_cuda:
+    is_stored = all(spec.instants.is_stored(t) for t in spec.instants.keys)
+    if processes < 2 or not is_stored or spec.run.stale or spec.run.model.gaussians.open.is_cuda:
         return render_frames(take, frames, done, report)
     parts = [missing[len(missing) * n // processes : len(missing) * (n + 1) // processes] for n in range(processes)]
     request = {
@@ -86,10 +86,10 @@ def render_side_by_side(
     shares: dict[int, Tensor] = {}
     with _started([{**request, "frames": part} for part in parts]) as messages:
         _listen(messages, len(parts), len(missing), shares, report)
-    lost = [n for n in missing if n not in shares]
-    right = right_frames(take, {n: stored_key(take.folder, n, spec) for n in lost})
-    rest = [output for output in frames if output.frame in lost and output.frame not in right]
-    return shares | (render_frames(take, rest, set(), report) if rest else {})
+    failed = [n for n in missing if n not in shares]
+    current = current_frames(take, {n: stored_key(take.folder, n, spec) for n in failed})
+    remaining = [output for output in frames if output.frame in failed and output.frame not in current]
+    return shares | (render_frames(take, remaining, set(), report) if remaining else {})
 
 
 def _listen(

@@ -39,8 +39,8 @@ PLAIN_FPS = 24.0
 """Frames per second of a stage if the footage has no frame rate."""
 
 
-def placed_splats(frozen: FrozenGaussians, scene: Scene, where: Similarity) -> PlyGaussians:
-    """A frozen instant transformed to Blender's scene; `where` is the similarity from solve units."""
+def placed_splats(frozen: FrozenGaussians, scene: Scene, transform: Similarity) -> PlyGaussians:
+    """A frozen instant transformed to Blender's scene; `transform` is the similarity from solve units."""
     state = {name: value.cpu() for name, value in frozen.state.items()}
     in_solve = PlyGaussians(
         (state["means"].double() / scene.scale + from_numpy(scene.centre)).float().numpy(),
@@ -49,7 +49,7 @@ def placed_splats(frozen: FrozenGaussians, scene: Scene, where: Similarity) -> P
         state["opacity_logits"].numpy(),
         torch.cat([state["sh0"], state["shN"]], dim=1).numpy(),
     )
-    return placed(in_solve, where)
+    return placed(in_solve, transform)
 
 
 def camera_path_of(shot: Shot, file: str) -> CameraPath:
@@ -67,9 +67,9 @@ def write_stage(
 
     OSError if the file cannot be written.
     """
-    where = Similarity.of(placement)
+    transform = Similarity.of(placement)
     try:
-        write_usd(path, splats, cameras, where, placement.metres_per_unit, fps or PLAIN_FPS)
+        write_usd(path, splats, cameras, transform, placement.metres_per_unit, fps or PLAIN_FPS)
     except NoUsdError:
         remove_file(path)
         report.warning(*_NO_USD)
@@ -104,8 +104,8 @@ def export_splats(shot: Shot, kind: str, folder: Path, take: str, placement: str
     if kind == "ply":
         return [write_ply(folder / PLY_FILE, *splats)]
     cameras = camera_path_of(shot, str(facts.get("camera_path", "")))
-    where, fps = Similarity.of(target), shot.info().fps or PLAIN_FPS
+    transform, fps = Similarity.of(target), shot.info().fps or PLAIN_FPS
     try:
-        return [write_usd(folder / USD_FILE, splats, cameras, where, target.metres_per_unit, fps)]
+        return [write_usd(folder / USD_FILE, splats, cameras, transform, target.metres_per_unit, fps)]
     except NoUsdError as error:
         raise JobError(*_NO_USD, ExitCode.ENVIRONMENT) from error

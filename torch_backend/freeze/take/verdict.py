@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...contract import VERDICT_WORDS, Verdict
-from ...train.verdict import EXPLAINED, spans_of, where_words
+from ...train.verdict import EXPLAINED, span_text, spans_of
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ def judge_take(
     rows = detail["per_frame"]
     frames = [int(row["frame"]) for row in rows]
     cells = np.array([row["regions"] for row in rows], np.float64)
-    lost = np.asarray(cells > limits.lost)
-    places = spans_of(frames, cells, lost)
+    is_guess = np.asarray(cells > limits.lost)
+    places = spans_of(frames, cells, is_guess)
     invented = float(detail["invented_share"])
     if invented > limits.fair_invented:
         word = "poor"
@@ -65,11 +65,11 @@ def judge_take(
         word = "fair" if invented > limits.good_invented or places else "good"
     plate = _percent(float(detail["plate_share"]))
     sentences = [f"{plate} % of the picture is plate, {100 - plate} % is a guess."]
-    sentences += [f"Mostly a guess in {where_words(place)}." for place in places]
+    sentences += [f"Mostly a guess in {span_text(place)}." for place in places]
     worst = min(rows, key=lambda row: float(row["plate_share"]))
     if not places and 1.0 - float(worst["plate_share"]) >= limits.named:
         sentences.append(f"Most of it in frame {worst['frame']}: {_percent(1.0 - float(worst['plate_share']))} %.")
-    steady = bool(lost.any(axis=0).any()) and float(lost.mean(axis=0).max()) >= limits.steady
+    steady = bool(is_guess.any(axis=0).any()) and float(is_guess.mean(axis=0).max()) >= limits.steady
     span = run.instants if run is not None else []
     return _with_run(Verdict(word, sentences, places, _advice(facts, frames, places, steady, word, span)), run)
 

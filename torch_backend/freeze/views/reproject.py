@@ -89,8 +89,8 @@ def blurred(picture: Tensor, sigma: float) -> Tensor:
 
         taps = cv2.getGaussianKernel(2 * reach + 1, sigma, cv2.CV_32F)
         values = np.ascontiguousarray(picture.detach().float().numpy())
-        made = cv2.sepFilter2D(values, -1, taps, taps, borderType=cv2.BORDER_REPLICATE)
-        return from_numpy(np.asarray(made, np.float32)).reshape(picture.shape)
+        result = cv2.sepFilter2D(values, -1, taps, taps, borderType=cv2.BORDER_REPLICATE)
+        return from_numpy(np.asarray(result, np.float32)).reshape(picture.shape)
     flat = (picture[..., None] if picture.ndim == 2 else picture).permute(2, 0, 1)[:, None]
     taps = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=flat.device) / sigma).square())
     taps = taps / taps.sum()
@@ -137,7 +137,7 @@ def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:
     return look_up(picture[top:bottom], pixels - down, "bicubic")
 
 
-def beyond(picture: Tensor, other: Tensor, reach: int) -> Tensor:
-    """[h, w] distance of a picture [h, w, 3] from the range of `other` within `reach` pixels, largest over channels."""
-    least, most = (torch.stack([of(each, reach) for each in other.unbind(-1)], -1) for of in (erode, dilate))
+def beyond(picture: Tensor, reference: Tensor, reach: int) -> Tensor:
+    """[h, w] distance of `picture` [h, w, 3] from the range of `reference` within `reach` pixels, largest channel."""
+    least, most = (torch.stack([of(channel, reach) for channel in reference.unbind(-1)], -1) for of in (erode, dilate))
     return torch.maximum(least - picture, picture - most).clamp_min(0.0).amax(-1)

@@ -38,17 +38,17 @@ class SceneFlow:
 
     def moved(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
         """The frozen or developed `state`, moved to a frame; differentiable."""
-        made = dict(state)
+        moved = dict(state)
         if frame == self.t_star:
-            return made
+            return moved
         if len(self.rows):
             change = self._change(frame)
-            made = {name: value.index_add(0, self.rows, change[name]) for name, value in made.items()}
-        if len(made["means"]) > self._known:
-            opacity = made["opacity_logits"]
-            own = torch.arange(len(opacity), device=opacity.device) < self._known
-            made["opacity_logits"] = torch.where(own, opacity, HIDDEN)
-        return made
+            moved = {name: value.index_add(0, self.rows, change[name]) for name, value in moved.items()}
+        if len(moved["means"]) > self._known:
+            opacity = moved["opacity_logits"]
+            is_run_row = torch.arange(len(opacity), device=opacity.device) < self._known
+            moved["opacity_logits"] = torch.where(is_run_row, opacity, HIDDEN)
+        return moved
 
     @torch.no_grad()
     def _change(self, frame: int) -> dict[str, Tensor]:

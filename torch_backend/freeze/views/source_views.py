@@ -83,7 +83,7 @@ class PlateView:
     """[h, w] float16 in 0..1: low-passed difference between the plate and the model's own render of it."""
     offsets: Tensor
     """[M, 3] means of the open Gaussians in that frame, scene units."""
-    shown: Tensor | None
+    rendered: Tensor | None
     """[h, w, 3] float16, the model's own render of the plate; None if plates are larger than decision resolution."""
     ignored: Tensor | None
     """[h, w, 1] in 0..1: ignored pixels, treated as an occluder in front of the scene; None: no pixel is ignored."""
@@ -159,10 +159,10 @@ class SourceViews:
         if frame not in self._views:
             self._views[frame] = self._make_view(frame)
             width, height = self.size
-            shown = 6.0 if self.size == (self.plates.width, self.plates.height) else 0.0
-            each = (20.0 + shown) * width * height + 12.0 * len(self.rows)
+            render_bytes = 6.0 if self.size == (self.plates.width, self.plates.height) else 0.0
+            view_bytes = (20.0 + render_bytes) * width * height + 12.0 * len(self.rows)
             room = _VIEWS_BYTES - 24.0 * self.plates.width * self.plates.height  # large frames need memory themselves
-            while len(self._views) > max(12, min(_VIEWS, room / each)):
+            while len(self._views) > max(12, min(_VIEWS, room / view_bytes)):
                 self._views.popitem(last=False)
         self._views.move_to_end(frame)
         return self._views[frame]
@@ -171,8 +171,8 @@ class SourceViews:
         """[H, W, 3] float16: plate `frame` minus the model's own render of it, display-referred, at plate size."""
         if frame not in self._residuals:
             self._residuals[frame] = self._missed(frame)
-            each = 6.0 * self.plates.width * self.plates.height
-            while len(self._residuals) > max(5, min(16, _RESIDUALS_BYTES / each)):
+            residual_bytes = 6.0 * self.plates.width * self.plates.height
+            while len(self._residuals) > max(5, min(16, _RESIDUALS_BYTES / residual_bytes)):
                 self._residuals.popitem(last=False)
         self._residuals.move_to_end(frame)
         return self._residuals[frame]
@@ -210,26 +210,26 @@ class SourceViews:
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height
         fine = min(1.0, _FINEST / width)
-        shown = self.view(frame).shown
-        if shown is None:
-            shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
+        rendered = self.view(frame).rendered
+        if rendered is None:
+            rendered = self._render(frame, round(width * fine), max(8, round(height * fine)))[1].color
         plate = self.plates.display(frame)
         self._most[frame] = float(plate.max())
         out = torch.empty(height, width, 3, dtype=torch.float16, device="cpu")
         ignored = self.view(frame).ignored
         if fine == 1.0 and ignored is None:
-            return torch.sub(plate, shown).half()
+            return torch.sub(plate, rendered).half()
         for top in range(0, height, _ROWS):  # a second picture of 4K would be another 100 MB
             rows = plate[top : top + _ROWS]
             at = pixel_centres(width, len(rows))
             at[..., 1] += top
-            missed = rows - look_up(shown, at * fine)
+            missed = rows - look_up(rendered, at * fine)
             if ignored is not None:
                 missed = missed * (1.0 - look_up(ignored, at * (self.size[0] / width)))
             out[top : top + _ROWS] = missed.half()
         return out
 
-    def _own_render(self, frame: int, width: int, height: int) -> tuple[FrozenGaussians, FrozenImage]:
+    def _render(self, frame: int, width: int, height: int) -> tuple[FrozenGaussians, FrozenImage]:
         time = self.scene.time_of_frame(frame)
         frozen = self.stage.at(frame)
         viewmat, K = self.camera(frame, width, height)
@@ -237,7 +237,7 @@ class SourceViews:
 
     def _make_view(self, frame: int) -> PlateView:
         width, height = self.size
-        frozen, image = self._own_render(frame, width, height)
+        frozen, image = self._render(frame, width, height)
         matte = self.moving(frame)
         moving = image.motion if matte is None else resized(matte, width, height)
         # The working frame is large enough, and faster to read than 4K footage.
@@ -246,10 +246,10 @@ class SourceViews:
         if ignored is not None:  # ignored pixels must not count as missed
             plate = torch.lerp(plate, image.color, ignored)
         missed = self.difference(plate, image.color)
-        off = self.difference(plate, image.color, 2)
+        difference = self.difference(plate, image.color, 2)
         region = round(2 * self.config.margin * self.unit)
-        off = blurred(dilate(off, region), 0.5 * region)
-        explained = torch.exp(-(off / self.config.unexplained).square()).half().float()
+        difference = blurred(dilate(difference, region), 0.5 * region)
+        explained = torch.exp(-(difference / self.config.unexplained).square()).half().float()
         return PlateView(
             *self.camera(frame, width, height),
             torch.stack([image.depth, dilate(moving, round(self.config.margin * self.unit)), explained], dim=-1),

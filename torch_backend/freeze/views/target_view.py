@@ -28,7 +28,7 @@ class TargetView:
     """The splats' render of the frame, overscan included."""
     exposed_at: float
     """Normalised time whose exposure the frame has."""
-    own: bool
+    is_clip_view: bool
     """True if pose, lens, exposure and size are those of a frame of the clip."""
     t: int
     """Frame number of plate t*, the plate nearest to the instant."""
@@ -48,7 +48,7 @@ class TargetView:
     """[h, w] in 0..1: where plates of other times are trusted only if they agree with the model."""
     moved: Tensor
     """[h, w] in 0..1: `motion`, and on the clip's own poses also the pixels where the frame's own plate is rejected."""
-    unseen: Tensor
+    out_of_view: Tensor
     """[h, w] in 0..1: pixels of moving surfaces that no plate near t* shows, so their state at t* is unknown."""
 
     def settings(self, width: int, height: int) -> RasterSettings:
@@ -89,15 +89,15 @@ def target_view(
     points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
     t = min(source_views.frames, key=lambda frame: abs(frame - output.t_star))
     motion = resized(image.motion, w, h)
-    own = _is_own(source_views, output, width, height)
-    nothing = torch.zeros_like(motion)
+    is_clip_view = _is_clip_view(source_views, output, width, height)
+    zeros = torch.zeros_like(motion)
     return TargetView(
-        output.viewmat, K, image, source_views.scene.time_of_frame(output.exposed_like), own, t, frozen, points, depth,
-        motion, w / columns, beyond, nothing, motion, nothing,
+        output.viewmat, K, image, source_views.scene.time_of_frame(output.exposed_like), is_clip_view, t, frozen,
+        points, depth, motion, w / columns, beyond, zeros, motion, zeros,
     )  # fmt: skip
 
 
-def _is_own(source_views: SourceViews, output: OutputFrame, width: int, height: int) -> bool:
+def _is_clip_view(source_views: SourceViews, output: OutputFrame, width: int, height: int) -> bool:
     """True if the frame has the pose, lens and exposure of a frame of the clip, and the size of its plate."""
     i = source_views.index.get(output.frame)
     return (
@@ -138,8 +138,8 @@ def displacements(
         state, 0, target.viewmat.to(extra.device), K.to(extra.device), w, h, colors=extra, with_contributions=False,
         settings=target.settings(w, h),
     )  # fmt: skip
-    shown = (out.colors[0, ..., 3:] / out.alphas[0].clamp_min(1e-3)[..., None]).cpu()
-    return [shown[..., 3 * n : 3 * n + 3] for n in range(len(chosen))]
+    flow = (out.colors[0, ..., 3:] / out.alphas[0].clamp_min(1e-3)[..., None]).cpu()
+    return [flow[..., 3 * n : 3 * n + 3] for n in range(len(chosen))]
 
 
 def with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> tuple[Tensor, tuple[int, int]]:
@@ -147,6 +147,6 @@ def with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> tup
     and above and below)."""
     rows, columns = image.alpha.shape
     beyond = (columns - width) // 2, (rows - height) // 2
-    wide = K.clone()
-    wide[:2, 2] += torch.tensor(beyond, dtype=K.dtype, device="cpu")
-    return wide, beyond
+    padded = K.clone()
+    padded[:2, 2] += torch.tensor(beyond, dtype=K.dtype, device="cpu")
+    return padded, beyond

@@ -77,8 +77,8 @@ class WorkingPlates:
         """[N] in 0..1: share of each Gaussian's contribution to a frame that falls on moving pixels."""
         matte = self.matte(frame)
         weights = torch.stack([matte, torch.ones_like(matte)], dim=-1)
-        inside, whole = gathered(frozen.state, *self.camera(frame), weights).unbind(1)
-        return torch.where(whole > SEEN, inside / whole.clamp_min(1e-6), 0.0)
+        inside, total = gathered(frozen.state, *self.camera(frame), weights).unbind(1)
+        return torch.where(total > SEEN, inside / total.clamp_min(1e-6), 0.0)
 
 
 def showing(trained: list[int], t_star: int) -> list[int]:

@@ -92,7 +92,7 @@ def sheet(x, y, z, step, board):
 class Sways(Deformation):
     """The board's exact motion."""
 
-    def forward(self, means, times, own=None):
+    def forward(self, means, times, host_params=None):
         x = SWAY * torch.sin((times * (FRAMES - 1) - 6) * math.pi / 12).expand(len(means))
         return Deltas(torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], 1))
 

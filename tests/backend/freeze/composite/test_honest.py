@@ -28,7 +28,7 @@ def world(tmp_path_factory, quiet):
 class Stays(Deformation):
     """No motion: the board stays at its position at T_STAR."""
 
-    def forward(self, means, times, own=None):
+    def forward(self, means, times, host_params=None):
         return Deltas(torch.tensor([board_at(T_STAR), 0.0, 0.0]).expand(len(means), 3))
 
 
@@ -50,7 +50,7 @@ def make(world, mattes, source_views=None, masked=None, **config):
     compositor = Compositor(world.run, world.scene, world.plates(), settings, moving)
     if masked is not None:
         at_t = torch.from_numpy(masked).float()
-        compositor.seen.ignored = lambda frame: at_t if frame == T_STAR else None
+        compositor.source_views.ignored = lambda frame: at_t if frame == T_STAR else None
     return world.make(world.output(FRAME, T_STAR), compositor)
 
 

@@ -30,7 +30,7 @@ def found(world):
     output = world.output(FRAME, T_STAR)
     frozen = freeze_at(world.run.model, world.scene.time_of_frame(T_STAR), 1.0)
     image = render_frozen(frozen, output.viewmat, output.K, W, H)
-    views: SourceViews = Compositor(world.run, world.scene, world.plates()).seen
+    views: SourceViews = Compositor(world.run, world.scene, world.plates()).source_views
     target = target_view(views, output, frozen, image, W, H)
     seen, instant = (views.seen(frame, target.points) for frame in (FRAME, T_STAR))
     told = evidence(views, target, FRAME, seen, instant, StateConfig())

@@ -13,7 +13,7 @@ from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.freeze.mattes.combined import Source, combine, combined, grown, with_motion
+from torch_backend.freeze.mattes.combined import Source, combine, combined, dilated, with_motion
 from torch_backend.freeze.mattes.job import make_mattes
 from torch_backend.freeze.surface.job import make_surface
 from torch_backend.raster import rasterize
@@ -170,6 +170,6 @@ def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
     alone = Lone(matte)
     assert alone.shows("it", 1, frame, is_live=False)[2, 25, 22] == 0.0
     assert alone.shows("it", 1, frame, is_live=True)[2, 25, 22] == 1.0
-    soft = grown(matte, 640)
+    soft = dilated(matte, 640)
     assert soft[15, 15] == pytest.approx(1.0, abs=1e-3) and 0.2 < soft[15, 23] < 1.0 and soft[15, 32] == 0.0
     assert torch.from_numpy(soft).isfinite().all()

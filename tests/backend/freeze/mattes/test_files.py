@@ -5,7 +5,7 @@ import OpenImageIO as oiio
 import pytest
 
 from torch_backend.contract import TakeFolder
-from torch_backend.freeze.mattes.files import is_current, matte_file, read_matte, suffixes_beside, write_matte
+from torch_backend.freeze.mattes.files import is_current, matte_file, read_matte, remaining_suffixes, write_matte
 
 
 @pytest.mark.parametrize(("suffix", "off"), [("exr", 2.5e-4), ("png", 1e-5)])
@@ -22,7 +22,7 @@ def test_a_matte_is_read_back(tmp_path, suffix, off):
     assert (spec.full_width, spec.full_height) == (14, 8)
     if suffix == "exr":
         assert np.abs(found - matte).max() <= off
-    assert suffix not in suffixes_beside(suffix) and suffixes_beside(suffix)
+    assert suffix not in remaining_suffixes(suffix) and remaining_suffixes(suffix)
 
 
 def test_a_file_that_is_cut_off_is_not_current(tmp_path):

@@ -24,8 +24,8 @@ from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.freeze.take import background_writer
 from torch_backend.freeze.take import frames as take_frames
-from torch_backend.freeze.take import write_beside
 from torch_backend.freeze.take.cameras import plan
 from torch_backend.freeze.take.job import missable
 from torch_backend.freeze.take.video import write_video
@@ -192,7 +192,7 @@ def test_frames_written_beside_the_next_are_those_written_at_once(trained, quiet
     world, _ = trained
     asked = dict(t_star=108, first=103, last=106, detail=detail, develop="off")
     for take, held in (("beside", 1 << 40), ("at once", -1)):
-        monkeypatch.setattr(write_beside, "HELD_BYTES", held)
+        monkeypatch.setattr(background_writer, "MAX_BACKGROUND_BYTES", held)
         freeze_shot(world.shot, FreezeParams(take=take, **asked), quiet())
     beside, at_once = world.shot.take("beside"), world.shot.take("at once")
     pictures = sorted(p.relative_to(beside) for p in beside.rglob("*.exr"))

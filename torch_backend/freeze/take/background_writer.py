@@ -6,11 +6,11 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
-HELD_BYTES = 400_000_000
+MAX_BACKGROUND_BYTES = 400_000_000
 """Size above which a frame is written before the next is rendered: two 4K frames would not fit in memory."""
 
 
-class WriteBeside:
+class BackgroundWriter:
     """Context manager that writes frames in order, one at a time; the block ends after the last write.
 
     At most one frame is written while another is rendered: `write` waits for the previous write. An error of a write is
@@ -23,9 +23,9 @@ class WriteBeside:
         self._last: Future[None] | None = None
 
     def write(self, work: Callable[[], None], size: int) -> None:
-        """Runs `work` in the background, or at once if `size` in bytes exceeds `HELD_BYTES`."""
+        """Runs `work` in the background, or at once if `size` in bytes exceeds `MAX_BACKGROUND_BYTES`."""
         self.wait()
-        if size > HELD_BYTES:
+        if size > MAX_BACKGROUND_BYTES:
             work()
         else:
             self._last = self._pool.submit(work)
@@ -36,7 +36,7 @@ class WriteBeside:
         if last is not None:
             last.result()
 
-    def __enter__(self) -> WriteBeside:
+    def __enter__(self) -> BackgroundWriter:
         return self
 
     def __exit__(
