@@ -15,7 +15,7 @@ OPEN = {
     "bake/render_settings.py: _picture(value)": "the value of any setting",
     "bake/render_settings.py: _set(owner)": "whatever has settings",
     "bake/render_settings.py: set_noted(value)": "the value of any setting",
-    "compat.py: _own_tree(scene)": "a Blender older than its types",
+    "compat.py: _scene_node_tree(scene)": "a Blender older than its types",
     "process/children.py: start(streams)": "what Popen takes, by name",
     "scene/scene_setup.py: _neutral(view)": "Blender's types know the views of one colour configuration",
     "scene/scene_setup.py: _same(one)": "the value of any setting",

@@ -63,14 +63,14 @@ def insert(
         ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is unchanged.
     """
     changes: list[str] = []
-    _need_own(compat.compositor_tree(scene))
+    _require_local(compat.compositor_tree(scene))
     behind = placing.place_of(scene, footage, where)
     wanted = freeze_group.wants_warp(scene) if warp is None else warp
     frozen, flow, stream = _frozen_image(take), _warp_image(take) if wanted else None, None
     if plate is not None and freeze_group.shows_plate(scene):
         stream = original_plate.plate_of(take, _shot_of(take), plate)
     if compat.compositor_tree(scene) is not None:  # all checks have passed
-        freeze_group.own_tree(scene)
+        freeze_group.single_user_tree(scene)
         behind = placing.place_of(scene, footage, where)
     enabled = compat.compositor_enabled(scene)
     before = {**compat.compositor_switches(scene), "made_tree": False}
@@ -108,7 +108,7 @@ def _placed(
         place = "as the plate: what follows it goes on from there" if behind is not None else "before the output"
         return node, [f'The node group "{GROUP_NAME}" was inserted {place}.']
     changes: list[str] = []
-    if where != "AUTO" and placing.stands_in(node) != (behind is not None):
+    if where != "AUTO" and placing.is_behind_plate(node) != (behind is not None):
         placing.lead_past(tree, node)
         placing.lead_through(tree, node, behind)
         changes.append(f'The node group "{GROUP_NAME}" was moved.')
@@ -116,7 +116,7 @@ def _placed(
     return node, [*changes, f'The node group "{GROUP_NAME}" was updated.']
 
 
-def _need_own(tree: bpy.types.NodeTree | None) -> None:
+def _require_local(tree: bpy.types.NodeTree | None) -> None:
     """Raises JobError if the compositor is linked from another file: changes would be lost when this file is
     reopened."""
     library = library_of(tree) if tree is not None else None
@@ -175,7 +175,7 @@ def may_combine_cg(scene: bpy.types.Scene) -> bpy.types.CompositorNodeGroup:
     Raises JobError without the group, or if its CG input is already linked.
     """
     tree = compat.compositor_tree(scene)
-    _need_own(tree)
+    _require_local(tree)
     node = freeze_group.group_node(tree) if tree else None
     if node is None:
         raise contract.JobError("The freeze is not in this compositor.", "Bake first.", contract.ExitCode.BAKE)
@@ -194,7 +194,7 @@ def combine_cg(scene: bpy.types.Scene) -> list[str]:
     The view layer must have its depth pass. Raises JobError as `may_combine_cg` does.
     """
     may_combine_cg(scene)
-    tree = freeze_group.own_tree(scene)
+    tree = freeze_group.single_user_tree(scene)
     node = present(freeze_group.group_node(tree))
     layers: Any = tree.nodes.new("CompositorNodeRLayers")
     layers[TAG] = _CG
@@ -212,7 +212,7 @@ def remove(scene: bpy.types.Scene) -> bool:
     node = freeze_group.group_node(tree) if tree else None
     if tree is None or node is None or library_of(tree):
         return False
-    tree = freeze_group.own_tree(scene)
+    tree = freeze_group.single_user_tree(scene)
     node = present(freeze_group.group_node(tree))
     group = present(node.node_tree)
     before = json.loads(group.get(freeze_group.BEFORE, "{}"))
@@ -236,7 +236,7 @@ def remove(scene: bpy.types.Scene) -> bool:
     return True
 
 
-def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Iterator[None]:
+def prefetch(take: Take, plate: Path | None = None, warp: bool = False) -> Iterator[None]:
     """Loads the images that `insert` needs, one per iteration. Blender's window is blocked while it loads an image."""
     wanted: list[tuple[Path, str, sequences.Encoding]] = [
         (numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", take.light)
@@ -247,7 +247,7 @@ def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Ite
         sequences.read(path, name, encoding, take.first, take.last)
         yield
     if plate is not None:
-        yield from original_plate.read_ahead(take, _shot_of(take), plate)
+        yield from original_plate.prefetch(take, _shot_of(take), plate)
 
 
 def _warp_picture(take: Take) -> tuple[Path, str, sequences.Encoding]:
@@ -273,9 +273,9 @@ def _show_plate(
     """
     ours, before = _stream_of(tree, node), placing.links_of(node.inputs["Image"])
     reader = next((n for n in ours if isinstance(n, bpy.types.CompositorNodeImage)), None)
-    others = before and before[0].from_node not in ours if reader is None else _is_others(reader.image)
-    stale = [] if others else _images(ours)
-    if not others:
+    is_foreign = before and before[0].from_node not in ours if reader is None else _is_foreign(reader.image)
+    stale = [] if is_foreign else _images(ours)
+    if not is_foreign:
         if reader is None:
             for old in ours:
                 original_plate.drop(old)
@@ -284,9 +284,9 @@ def _show_plate(
             sequences.show_sequence(reader, plate.image, take.first, take.last, plate.shift)
             _follow_plate(scene, tree, node, reader, ours, plate)
     for image in {i.name: i for i in [*stale, plate.image, plate.map] if i is not None}.values():
-        if image.users == 0 and not _is_others(image):
+        if image.users == 0 and not _is_foreign(image):
             bpy.data.images.remove(image)
-    return not others
+    return not is_foreign
 
 
 def _stream_of(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> list[bpy.types.Node]:
@@ -296,7 +296,7 @@ def _stream_of(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) ->
     return sorted(marked, key=lambda n: n not in led)
 
 
-def _is_others(image: bpy.types.Image | None) -> bool:
+def _is_foreign(image: bpy.types.Image | None) -> bool:
     return image is not None and not image.get(TAG)
 
 
@@ -340,8 +340,8 @@ def _follow_plate(
         original_plate.refill(inner, plate)
         stream = inner.outputs[0]
     elif inner is not None or wanted:
-        beside = (inner or fit or node).location
-        place = (beside.x - (0 if inner else GAP if fit else 2 * GAP), beside.y)
+        anchor = (inner or fit or node).location
+        place = (anchor.x - (0 if inner else GAP if fit else 2 * GAP), anchor.y)
         targets = [present(k.to_socket) for k in placing.links_of(stream if inner is None else inner.outputs[0])]
         if inner is not None:
             stream = next((present(k.from_socket) for k in placing.links_of(inner.inputs[0])), stream)

@@ -82,7 +82,11 @@ def fill(
 
 
 def _warped(
-    group: bpy.types.NodeTree, enter: bpy.types.Node, own: bpy.types.NodeSocket, image: bpy.types.Image, take: Take
+    group: bpy.types.NodeTree,
+    enter: bpy.types.Node,
+    frame_socket: bpy.types.NodeSocket,
+    image: bpy.types.Image,
+    take: Take,
 ) -> bpy.types.NodeSocket:
     """Socket of the frozen image: the take's frames, or the group's input frozen by the take's warp."""
     reader = group.nodes.new("CompositorNodeImage")
@@ -93,7 +97,7 @@ def _warped(
     node, factor, first, second, mixed = compat.new_mix_node(group)
     node.label, node.location = AS_WARP, (-2 * GAP, 330.0)
     group.links.new(enter.outputs[AS_WARP], factor)
-    group.links.new(own, first)
+    group.links.new(frame_socket, first)
     group.links.new(frozen, second)
     return mixed
 
@@ -270,9 +274,11 @@ def _share(
     return total
 
 
-def _product(group: bpy.types.NodeTree, one: bpy.types.NodeSocket, other: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+def _product(
+    group: bpy.types.NodeTree, first: bpy.types.NodeSocket, second: bpy.types.NodeSocket
+) -> bpy.types.NodeSocket:
     node = compat.new_math_node(group)
     node.location = (0.0, 330.0)
-    group.links.new(one, node.inputs[0])
-    group.links.new(other, node.inputs[1])
+    group.links.new(first, node.inputs[0])
+    group.links.new(second, node.inputs[1])
     return node.outputs[0]

@@ -46,11 +46,11 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
     return changes
 
 
-def read_ahead(scene: bpy.types.Scene, shot: Path, take: str) -> Iterator[None]:
+def prefetch(scene: bpy.types.Scene, shot: Path, take: str) -> Iterator[None]:
     """Loads the images that `insert` will need, one per iteration. Raises JobError as `insert` does."""
     frozen, plate = _sources(scene, shot, take)
     shown = plate if freeze_group.shows_plate(scene) else None
-    return compositor.read_ahead(frozen, shown, freeze_group.wants_warp(scene))
+    return compositor.prefetch(frozen, shown, freeze_group.wants_warp(scene))
 
 
 def _need_warp(shot: Path, take: Take) -> None:
@@ -187,7 +187,7 @@ def _turns(scene_uid: int, shot: Path, take: str, only: int) -> Iterator[None]:
     with contextlib.suppress(
         contract.JobError, OSError, RuntimeError, ValueError
     ):  # `insert_freeze` reports the same error
-        yield from read_ahead(present(session.scene_of(scene_uid)), shot, take)
+        yield from prefetch(present(session.scene_of(scene_uid)), shot, take)
     seen = 0
 
     def put_in(scene: bpy.types.Scene) -> list[str]:

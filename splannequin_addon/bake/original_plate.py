@@ -116,7 +116,7 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
     return Plate(image, st, remarks, footage.size, footage.shift)
 
 
-def read_ahead(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
+def prefetch(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
     """Loads the images that `plate_of` will need, one per iteration."""
     footage, _ = footage_of(take, shot)
     if footage is None or not compat.knows_colour(footage.probe):

@@ -16,7 +16,7 @@ from ..access import present, size_of
 from ..scene import same_footage, scene_setup
 from ..scene.ownership import TAG
 
-_STANDS_IN = "splannequin_stands_in"
+_BEHIND_PLATE = "splannequin_stands_in"
 _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 
 
@@ -25,8 +25,8 @@ def lead_through(
 ) -> None:
     """Routes links through our node: all links from the socket `behind`, or, with None, the link to the output."""
     if behind is not None:
-        source, targets, beside = behind, [present(link.to_socket) for link in links_of(behind)], present(behind.node)
-        node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 320.0)
+        source, targets, anchor = behind, [present(link.to_socket) for link in links_of(behind)], present(behind.node)
+        node.location = (anchor.location.x + anchor.width + 30.0, anchor.location.y - 320.0)
     else:
         end = present(compat.output_socket(tree) or compat.new_output_node(tree))
         source, targets, last = links_of(end)[0].from_socket if end.is_linked else None, [end], present(end.node)
@@ -35,7 +35,7 @@ def lead_through(
         tree.links.new(node.outputs["Image"], target)
     if source is not None:
         tree.links.new(source, node.inputs["Image"])
-    present(node.node_tree)[_STANDS_IN] = behind is not None
+    present(node.node_tree)[_BEHIND_PLATE] = behind is not None
 
 
 def lead_past(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> None:
@@ -48,9 +48,9 @@ def lead_past(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> 
         tree.links.remove(link)
 
 
-def stands_in(node: bpy.types.CompositorNodeGroup) -> bool:
+def is_behind_plate(node: bpy.types.CompositorNodeGroup) -> bool:
     """True if our node lies behind the plate, False if it lies before the output."""
-    return bool(present(node.node_tree).get(_STANDS_IN))
+    return bool(present(node.node_tree).get(_BEHIND_PLATE))
 
 
 def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy.types.NodeSocket | None:

@@ -182,8 +182,8 @@ def _set(owner: Any, row: Setting) -> bool:
 
 
 def _owner(scene: bpy.types.Scene, path: str) -> Any:
-    held: Any = scene
-    return held.path_resolve(path) if path else held
+    untyped: Any = scene
+    return untyped.path_resolve(path) if path else untyped
 
 
 def _has(scene: bpy.types.Scene, row: Setting) -> bool:

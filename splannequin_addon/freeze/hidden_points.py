@@ -62,10 +62,10 @@ def _restore(*_: object) -> None:
             entry.points_hidden_in = ""
 
 
-def _names(told: str) -> list[str]:
+def _names(stored: str) -> list[str]:
     """View layers that `_hide` stored; empty if the file was edited by hand."""
     try:
-        names: object = json.loads(told)
+        names: object = json.loads(stored)
     except ValueError:
         return []
     return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []  # pyright: ignore[reportUnknownVariableType]

@@ -122,10 +122,10 @@ def _world(
     tree = present(world.node_tree)
     tree.nodes.clear()
     kinds = ("TexCoord", "Mapping", "Mapping", "TexEnvironment", "Background", "OutputWorld")
-    made: list[Any] = [tree.nodes.new(f"ShaderNode{kind}") for kind in kinds]
-    for column, node in enumerate(made):
-        node.location = (260.0 * (column - len(made)), 300.0)
-    source, to_solve, to_picture, picture, background, output = made
+    nodes: list[Any] = [tree.nodes.new(f"ShaderNode{kind}") for kind in kinds]
+    for column, node in enumerate(nodes):
+        node.location = (260.0 * (column - len(nodes)), 300.0)
+    source, to_solve, to_picture, picture, background, output = nodes
     to_solve.label, to_picture.label = "From the Shot's Root", "To the Panorama"
     to_solve.vector_type, to_picture.vector_type = "TEXTURE", "VECTOR"
     _follow(to_solve.inputs["Rotation"], root)

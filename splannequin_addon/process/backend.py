@@ -92,7 +92,7 @@ def python() -> str:
 def _wrong_with(python: Path) -> str:
     """Sentence why an interpreter's environment cannot be used; empty if it can."""
     folder = python.parent.parent
-    if environment.half_made(python):
+    if environment.is_incomplete(python):
         return f"The backend's set-up has not finished: the environment in {folder} is half-made."
     changed = ", ".join(environment.changed(python))
     return f"The backend in {folder} was changed since it was set up: {changed}." if changed else ""

@@ -143,7 +143,7 @@ def cancel(setup: SetUp) -> None:
         setup.process.terminate()
 
 
-def half_made(python: Path) -> bool:
+def is_incomplete(python: Path) -> bool:
     """True if the launcher has started but not finished an interpreter's environment. An environment without the
     launcher's notes counts as finished.
 

@@ -177,7 +177,7 @@ def stop_work(watch: Watch) -> bool:
     watch.work = None
     if isinstance(turns, Generator):
         turns.close()
-    sequences.forget_ahead()  # images loaded ahead may be outdated when they are needed
+    sequences.clear_prefetched()  # images loaded ahead may be outdated when they are needed
     return True
 
 
@@ -323,9 +323,9 @@ def _turn(watch: Watch, until: float) -> bool:
         if job.ended or time.monotonic() > until:
             continue
         try:
-            before = _told(job)
+            before = _shown_state(job)
             jobs.poll(job, max(until - time.monotonic(), 0.001))
-            changed |= before != _told(job)
+            changed |= before != _shown_state(job)
         except (OSError, ValueError, KeyError) as error:
             watch.failures[step] = (f"The job in {job.folder} cannot be read: {error}", "")
             del watch.jobs[step]
@@ -364,7 +364,7 @@ def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
         _apply(watch, step, job)
 
 
-def _told(job: jobs.Job) -> tuple[Any, ...]:
+def _shown_state(job: jobs.Job) -> tuple[Any, ...]:
     """The state of a job that the panel shows."""
     status = job.status
     shown = (status.state, status.stage, round(status.fraction, 2), status.message) if status is not None else ()
@@ -448,7 +448,7 @@ def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
 def _on_load(*_: object) -> None:
     """Handler: another file was loaded. Its shots are examined again; running jobs continue and are found again."""
     markers.forget()
-    sequences.forget_ahead()
+    sequences.clear_prefetched()
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     redraw()

@@ -294,8 +294,8 @@ def latest(shot: Path) -> dict[str, Job]:
     found: dict[str, Job] = {}
     jobs_folder = contract.ShotFolder(shot).jobs
     # A link would lead to the jobs of another shot, into which this add-on must not write.
-    is_own = shot.is_dir() and not contract.is_link(jobs_folder)
-    folders = sorted(jobs_folder.glob("*/"), key=lambda p: p.name, reverse=True) if is_own else []
+    is_local = shot.is_dir() and not contract.is_link(jobs_folder)
+    folders = sorted(jobs_folder.glob("*/"), key=lambda p: p.name, reverse=True) if is_local else []
     for folder in folders:
         if contract.is_link(folder):
             continue
@@ -459,12 +459,12 @@ def _keep(job: Job, status: contract.Status) -> contract.Status:
 
 def _age(folder: Path) -> float:
     """Age of a job in seconds, by the clock of its disk, because another computer may have created it."""
-    now, made = time.time(), 0.0
+    now, created = time.time(), 0.0
     with contextlib.suppress(OSError):
         now = contract.disk_time(folder)
     with contextlib.suppress(OSError):
-        made = (folder / contract.REQUEST_FILE).stat().st_mtime
-    return now - made
+        created = (folder / contract.REQUEST_FILE).stat().st_mtime
+    return now - created
 
 
 def _kill(job: Job) -> None:

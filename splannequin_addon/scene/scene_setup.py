@@ -91,8 +91,8 @@ def kept(scene: bpy.types.Scene) -> str:
     """JSON with the scene's size, rate and range, and the values of them set by this module. Input of `put_back`."""
     ours = json.loads(scene.get(_OURS, "{}"))
     now = {owner: {name: getattr(_owner(scene, owner), name) for name in names} for owner, names in _SHOTS.items()}
-    set_here = {o: {n: v for n, v in ours.get(o, {}).items() if n in names} for o, names in _SHOTS.items()}
-    return json.dumps({"now": now, "ours": set_here})
+    set_values = {o: {n: v for n, v in ours.get(o, {}).items() if n in names} for o, names in _SHOTS.items()}
+    return json.dumps({"now": now, "ours": set_values})
 
 
 def put_back(scene: bpy.types.Scene, was: str) -> None:
@@ -105,8 +105,8 @@ def put_back(scene: bpy.types.Scene, was: str) -> None:
         _set(scene, owner, different)
     ours = json.loads(scene[_OURS])
     for owner, names in _SHOTS.items():
-        others = {n: v for n, v in ours.get(owner, {}).items() if n not in names}
-        ours[owner] = others | stored["ours"].get(owner, {})
+        unrelated = {n: v for n, v in ours.get(owner, {}).items() if n not in names}
+        ours[owner] = unrelated | stored["ours"].get(owner, {})
     scene[_OURS] = json.dumps(ours)
     if not scene.frame_start <= scene.frame_current <= scene.frame_end:
         scene.frame_set(scene.frame_start)
@@ -209,16 +209,16 @@ def restore(scene: bpy.types.Scene) -> bool:
 def _touched(scene: bpy.types.Scene) -> dict[str, set[str]]:
     """Owner -> settings that were set here and changed by the artist since, with the settings that belong to them."""
     found: dict[str, set[str]] = {}
-    for owner, set_here in json.loads(scene.get(_OURS, "{}")).items():
-        touched = {n for n, v in set_here.items() if not _same(getattr(_owner(scene, owner), n), v)}
+    for owner, set_values in json.loads(scene.get(_OURS, "{}")).items():
+        touched = {n for n, v in set_values.items() if not _same(getattr(_owner(scene, owner), n), v)}
         for group in _TOGETHER:
             touched |= group if touched & group else set()
         found[owner] = touched
     return found
 
 
-def _same(one: Any, other: Any) -> bool:
-    return abs(one - other) < 1e-5 if isinstance(other, float) else bool(one == other)
+def _same(first: Any, second: Any) -> bool:
+    return abs(first - second) < 1e-5 if isinstance(second, float) else bool(first == second)
 
 
 def _owner(scene: bpy.types.Scene, name: str) -> Any:

@@ -85,9 +85,9 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
         ) from error
 
 
-def written(asked: children.Question, file: Path, shot: Path) -> Path:
+def written(question: children.Question, file: Path, shot: Path) -> Path:
     """The transforms.json from the second Blender. Raises JobError with that Blender's message if it failed."""
-    asked.answer(f"Blender could not read {file.name}: {{}}", "Import the file, and choose Scene Camera.")
+    question.answer(f"Blender could not read {file.name}: {{}}", "Import the file, and choose Scene Camera.")
     return contract.ShotFolder(shot).tracking
 
 

@@ -135,7 +135,7 @@ class StepPanel:
         work = watch.work
         if work is not None:
             row = layout.split(factor=0.7, align=True) if work.turns is not None else layout
-            self._own_progress(row, context, work.progress)
+            self._work_progress(row, context, work.progress)
             if work.turns is not None:
                 row.operator("splannequin.cancel", text="Cancel", icon=icons.of("splannequin.cancel")).step = self.step
             return
@@ -153,7 +153,7 @@ class StepPanel:
         if started_elsewhere(job):
             wrap(layout, context, f"Started from {job.blend}.", "FILE_BLEND")
 
-    def _own_progress(
+    def _work_progress(
         self, layout: bpy.types.UILayout, context: bpy.types.Context, now: job_timer.Progress | None
     ) -> None:
         """Draws the progress of work done in Blender."""
