@@ -23,7 +23,7 @@ TOLERANCE_PX = 0.5
 """Largest allowed distance, in pixels of the render, between the projections of a scene point by the two cameras."""
 
 
-def is_led_in(scene: bpy.types.Scene) -> bool:
+def is_cg_linked(scene: bpy.types.Scene) -> bool:
     """True if a render of the scene is linked to the freeze group's CG input."""
     return bool(_layers(scene))
 

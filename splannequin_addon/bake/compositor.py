@@ -27,7 +27,7 @@ from .take_files import Take
 
 _CG = "cg"
 """Tag value of our Render Layers node, which is not part of the plate's stream."""
-_HOW = "splannequin_how"
+_FIT_MODE = "splannequin_how"
 """Property of the plate's Scale node: the fit that we set last. A fit set by the artist stays until the plate or the
 scene changes shape."""
 _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
@@ -86,11 +86,11 @@ def insert(
     node, done = _placed(tree, before, behind, where)
     changes += done
     changes += freeze_group.switch_warp(node, wanted, flow is not None)
-    changes += freeze_group.give_passes(node, _layers_of(frozen, take))
+    changes += freeze_group.update_passes(node, _layers_of(frozen, take))
     group_inside.fill(scene, node, take, frozen, flow)
-    changes += freeze_group.lacking(node)
+    changes += freeze_group.missing_layers(node)
     if stream is not None:
-        changes += stream.said if _show_plate(scene, tree, node, stream, take) else []
+        changes += stream.remarks if _show_plate(scene, tree, node, stream, take) else []
     return changes
 
 
@@ -104,15 +104,15 @@ def _placed(
     node = freeze_group.group_node(tree)
     if node is None:
         node = freeze_group.new_node(tree, before)
-        placing.lead_through(tree, node, behind)
+        placing.route_through(tree, node, behind)
         place = "as the plate: what follows it goes on from there" if behind is not None else "before the output"
         return node, [f'The node group "{GROUP_NAME}" was inserted {place}.']
     changes: list[str] = []
     if where != "AUTO" and placing.is_behind_plate(node) != (behind is not None):
-        placing.lead_past(tree, node)
-        placing.lead_through(tree, node, behind)
+        placing.bypass(tree, node)
+        placing.route_through(tree, node, behind)
         changes.append(f'The node group "{GROUP_NAME}" was moved.')
-    freeze_group.set_defaults(node, freeze_group.give_sockets(present(node.node_tree)))
+    freeze_group.set_defaults(node, freeze_group.add_sockets(present(node.node_tree)))
     return node, [*changes, f'The node group "{GROUP_NAME}" was updated.']
 
 
@@ -216,7 +216,7 @@ def remove(scene: bpy.types.Scene) -> bool:
     node = present(freeze_group.group_node(tree))
     group = present(node.node_tree)
     before = json.loads(group.get(freeze_group.BEFORE, "{}"))
-    placing.lead_past(tree, node)
+    placing.bypass(tree, node)
     images = [n.image for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
     textures = [t for n in group.nodes if n.bl_idname == "CompositorNodeTexture" and (t := getattr(n, "texture", None))]
     tree.nodes.remove(node)
@@ -292,8 +292,8 @@ def _show_plate(
 def _stream_of(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> list[bpy.types.Node]:
     """Our nodes of the plate's stream. Copies of them carry the same tag, so nodes upstream of the group come first."""
     marked = [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]
-    led = placing.upstream(node)
-    return sorted(marked, key=lambda n: n not in led)
+    sources = placing.upstream(node)
+    return sorted(marked, key=lambda n: n not in sources)
 
 
 def _is_foreign(image: bpy.types.Image | None) -> bool:
@@ -349,16 +349,16 @@ def _follow_plate(
         stream = original_plate.through(tree, stream, plate, place)
         for target in targets:
             tree.links.new(stream, target)
-    how, led = fitting.how_it_fits(scene, plate.size), node.inputs["Image"]
-    if fit is None and not led.is_linked:
-        fit = compat.new_fit_node(tree, how)
-        fit[TAG], fit[_HOW] = True, how
+    mode, image_input = fitting.fit_mode(scene, plate.size), node.inputs["Image"]
+    if fit is None and not image_input.is_linked:
+        fit = compat.new_fit_node(tree, mode)
+        fit[TAG], fit[_FIT_MODE] = True, mode
         fit.label = "Fit Plate"
         fit.location = (node.location.x - GAP, node.location.y)
-    elif fit is not None and fit.get(_HOW) != how:
-        compat.set_fit(fit, how)
-        fit[_HOW] = how
+    elif fit is not None and fit.get(_FIT_MODE) != mode:
+        compat.set_fit(fit, mode)
+        fit[_FIT_MODE] = mode
     if fit is not None and not fit.inputs[0].is_linked:
         tree.links.new(stream, fit.inputs[0])
-    if fit is not None and not led.is_linked:
-        tree.links.new(fit.outputs[0], led)
+    if fit is not None and not image_input.is_linked:
+        tree.links.new(fit.outputs[0], image_input)

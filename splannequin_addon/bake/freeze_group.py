@@ -44,7 +44,7 @@ def wants_warp(scene: bpy.types.Scene) -> bool:
     return node is not None and bool(present(node.node_tree).get(_WARPS))
 
 
-def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
+def missing_layers(node: bpy.types.CompositorNodeGroup) -> list[str]:
     """A sentence for each setting of our node whose layers the take lacks."""
     inside, remarks = present(node.node_tree).nodes, list[str]()
     if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
@@ -146,7 +146,7 @@ def _factor(socket: Any, value: float) -> None:
     socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
 
 
-def give_sockets(group: bpy.types.NodeTree) -> set[str]:
+def add_sockets(group: bpy.types.NodeTree) -> set[str]:
     """Adds the missing sockets to a group; sockets of an older version stay. Returns the names of new inputs."""
     existing = {(i.in_out, i.name) for i in compat.sockets_of(group)}
     added: set[str] = set()
@@ -180,7 +180,7 @@ def give_sockets(group: bpy.types.NodeTree) -> set[str]:
     return added
 
 
-def give_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[str]:
+def update_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[str]:
     """Adds the outputs of the take's passes to our node, and removes the outputs of missing passes.
 
     A linked output stays even if its pass is missing. Returns a sentence for each such output.
@@ -220,7 +220,7 @@ def new_node(tree: bpy.types.NodeTree, before: dict[str, bool]) -> bpy.types.Com
     assert isinstance(group, bpy.types.CompositorNodeTree)
     group[TAG] = True
     group[BEFORE] = json.dumps(before)
-    give_sockets(group)
+    add_sockets(group)
     node = tree.nodes.new("CompositorNodeGroup")
     assert isinstance(node, bpy.types.CompositorNodeGroup)
     node.node_tree = group

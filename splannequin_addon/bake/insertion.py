@@ -36,13 +36,13 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
         _need_warp(shot, frozen)
     footage = _footage(scene, shot, plate)
     changes = compositor.insert(scene, frozen, plate, footage, settings_of(scene).insert_at, warp)
-    lacking = inventory.missing_frames(shot, take, rendering.frames_of(scene))
-    if cg_camera.is_led_in(scene):
+    missing = inventory.missing_frames(shot, take, rendering.frames_of(scene))
+    if cg_camera.is_cg_linked(scene):
         numbers = rendering.frames_of(scene)
         wrong = cg_camera.difference(scene, frozen.folder, [numbers[0], numbers[-1]]) if numbers else ""
         changes += [wrong] if wrong else []
-    if lacking:
-        changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
+    if missing:
+        changes.append(f"{len(missing)} frames of the scene's range are not in the take, the first is {missing[0]}.")
     return changes
 
 

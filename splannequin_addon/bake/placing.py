@@ -20,7 +20,7 @@ _BEHIND_PLATE = "splannequin_stands_in"
 _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 
 
-def lead_through(
+def route_through(
     tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup, behind: bpy.types.NodeSocket | None
 ) -> None:
     """Routes links through our node: all links from the socket `behind`, or, with None, the link to the output."""
@@ -38,8 +38,8 @@ def lead_through(
     present(node.node_tree)[_BEHIND_PLATE] = behind is not None
 
 
-def lead_past(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> None:
-    """Undoes `lead_through`: reconnects the group's input directly to the targets of its output."""
+def bypass(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> None:
+    """Undoes `route_through`: reconnects the group's input directly to the targets of its output."""
     sources = [present(link.from_socket) for link in links_of(node.inputs["Image"])]
     for target in [present(link.to_socket) for link in links_of(node.outputs["Image"])]:
         if sources:
@@ -64,9 +64,9 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
     if where == "OUTPUT" or tree is None:
         return None
     end = compat.output_socket(tree)
-    led = upstream(end.node if end is not None else None)
-    led = [n for n in led if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
-    nodes = [n for n in tree.nodes if n in led and _picture(n).is_linked]
+    readers = upstream(end.node if end is not None else None)
+    readers = [n for n in readers if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
+    nodes = [n for n in tree.nodes if n in readers and _picture(n).is_linked]
     found = [n for n in nodes if same_footage.shows(_shown(n), footage)]
     if where == "PLATE" and not found:  # shown under another name: take the active node, or the only one
         found = [n for n in nodes if n == tree.nodes.active] or (nodes if len(nodes) == 1 else [])

@@ -90,7 +90,7 @@ class Run:
         self.wanted = list(frames_of(scene))
         self.done: list[int] = []
         """Frames that Blender has rendered and whose images have their final names."""
-        self.said: list[str] = []
+        self.notes: list[str] = []
         """Sentences about the changes made for the render, and about its images."""
         self.error: BaseException | None = None
         """The exception that ended the render."""
@@ -120,22 +120,22 @@ class Run:
         self._places = _places(scene, self.wanted, self._folder)
         first = self._places[self.wanted[0]].parent
         self._temporary = first / f"{_PART_PREFIX}{uuid.uuid4().hex[:12]}"
-        self.said = render_settings.apply(scene, render_settings.needed(scene, self._is_exact, has_cg))
-        self.said += _output_notes(scene)
+        self.notes = render_settings.apply(scene, render_settings.needed(scene, self._is_exact, has_cg))
+        self.notes += _output_notes(scene)
         try:
             contract.make_folder(first)  # first and separately, so that an OS error names this folder
             contract.make_folder(self._temporary)
             where = self._temporary / (self._places[self.wanted[0]].name if self._is_movie else DIGITS)
-            self._files = _aimed(scene, where, self.wanted)
+            self._files = _set_output_path(scene, where, self.wanted)
         except BaseException as error:
             self._clean(scene)
             if isinstance(error, OSError):
-                raise _in_words(error) from error
+                raise _readable_error(error) from error
             raise
         if sys.getswitchinterval() < _UNINTERRUPTED:
             _usual_interval[0] = sys.getswitchinterval()
             sys.setswitchinterval(_UNINTERRUPTED)
-        render_settings.going_on[self.scene_uid] = False
+        render_settings.active_bakes[self.scene_uid] = False
         bpy.app.handlers.render_write.append(self._written)
 
     def finish(self, scene: bpy.types.Scene | None, is_cancelled: bool = False) -> None:
@@ -150,8 +150,8 @@ class Run:
         """
         with contextlib.suppress(ValueError):
             bpy.app.handlers.render_write.remove(self._written)
-        render_settings.going_on.pop(self.scene_uid, None)
-        if not render_settings.going_on:
+        render_settings.active_bakes.pop(self.scene_uid, None)
+        if not render_settings.active_bakes:
             sys.setswitchinterval(_usual_interval[0])
         try:
             if self._check_cancelled and self.error is None:
@@ -171,7 +171,7 @@ class Run:
             lost = [n for n in self.wanted if n not in set(self.done)]
             if is_whole and lost:
                 message = f"Blender wrote no picture for frame {lost[0]} in {self._folder_name()}."
-                raise self._or_full(message, None)
+                raise self._write_error(message, None)
             if self.error is not None:
                 raise self.error
         finally:
@@ -181,7 +181,7 @@ class Run:
         """Stores Blender's error about a scene that it cannot render, or an image that it cannot write."""
         message = " ".join(str(error).split()).removeprefix("Error: ")
         message = message.replace(str(self._temporary), str(self._folder_name()))
-        self.error = self.error or self._or_full(f"Blender could not render the scene: {message}", None)
+        self.error = self.error or self._write_error(f"Blender could not render the scene: {message}", None)
 
     def is_of(self, scene: bpy.types.Scene) -> bool:
         """True if this run renders the scene."""
@@ -202,8 +202,8 @@ class Run:
         number = scene.frame_current
         try:
             if self.error is None and number in self._files:
-                if render_settings.going_on.get(self.scene_uid):
-                    render_settings.going_on[self.scene_uid] = False
+                if render_settings.active_bakes.get(self.scene_uid):
+                    render_settings.active_bakes[self.scene_uid] = False
                     self._unreliable.append(number)
                     return
                 if not self._is_movie:
@@ -214,7 +214,7 @@ class Run:
                 if self._check_cancelled:
                     self._check_cancelled()
         except BaseException as error:  # Blender would print it and continue to render
-            self.error = self.error or (_in_words(error) if isinstance(error, OSError) else error)
+            self.error = self.error or (_readable_error(error) if isinstance(error, OSError) else error)
         if self.error is not None:
             # The render loop continues from this frame number: after the last frame it ends and closes its files.
             scene.frame_current = scene.frame_end
@@ -222,7 +222,7 @@ class Run:
     def _publish(self, path: Path, place: Path, what: str) -> None:
         """Moves a complete file to its final name. Raises JobError if it is incomplete, or OSError."""
         if not contract.is_whole_picture(path):
-            raise self._or_full(f"Blender wrote {what} only in part to {place.parent}.", path)
+            raise self._write_error(f"Blender wrote {what} only in part to {place.parent}.", path)
         with open(path, "rb+") as file:
             os.fsync(file.fileno())
         contract.make_folder(place.parent)
@@ -237,9 +237,9 @@ class Run:
                 try:
                     self._publish(path, place, path.name)
                 except (contract.JobError, OSError) as error:
-                    self.error = self.error or (_in_words(error) if isinstance(error, OSError) else error)
+                    self.error = self.error or (_readable_error(error) if isinstance(error, OSError) else error)
 
-    def _or_full(self, message: str, path: Path | None) -> contract.JobError:
+    def _write_error(self, message: str, path: Path | None) -> contract.JobError:
         """The error for an image that Blender wrote partly or not at all: a full disk, or `message`.
 
         Args:
@@ -294,7 +294,7 @@ def render(
         )
     run = Run(scene, folder, png or is_part, on_frame, check_cancelled, check)
     run.begin(scene)
-    for line in run.said if say else ():
+    for line in run.notes if say else ():
         say(line)  # pyright: ignore[reportOptionalCall]
     try:
         bpy.ops.render.render(animation=True, scene=scene.name)
@@ -368,7 +368,7 @@ def _named(scene: bpy.types.Scene, frames: list[int]) -> dict[int, Path]:
         ) from error
 
 
-def _aimed(scene: bpy.types.Scene, pattern: Path, frames: list[int]) -> dict[int, Path]:
+def _set_output_path(scene: bpy.types.Scene, pattern: Path, frames: list[int]) -> dict[int, Path]:
     """Sets the scene's output path to a literal path. Returns frame -> file. Raises JobError if Blender cannot use
     it."""
     text = os.path.abspath(pattern)
@@ -393,7 +393,7 @@ def _unusable(folder: Path) -> contract.JobError:
     )
 
 
-def _in_words(error: OSError) -> BaseException:
+def _readable_error(error: OSError) -> BaseException:
     return contract.path_error(error) or error
 
 

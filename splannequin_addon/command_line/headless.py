@@ -65,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
             contract.end_with_starter()
         for note in contract.notes(args):
             print(f"note: {note}", file=sys.stderr, flush=True)
-        return int(_DOES[args.command](args, Console(contract.as_json(args))))
+        return int(_COMMANDS[args.command](args, Console(contract.as_json(args))))
     except SystemExit as stop:
         return int(stop.code or 0)
     except (contract.Cancelled, KeyboardInterrupt):
@@ -464,7 +464,7 @@ def _output(args: argparse.Namespace) -> Path:
     return output
 
 
-_DOES = {
+_COMMANDS = {
     "import": import_clip,
     "solve": solve,
     "train": train,

@@ -72,7 +72,7 @@ def _names(stored: str) -> list[str]:
 
 
 @persistent
-def _agree(*_: object) -> None:
+def _update(*_: object) -> None:
     """Handler after a save, an undo or a file load: the points are hidden if and only if their shot is being
     scrubbed."""
     _restore()
@@ -85,7 +85,7 @@ def _handlers() -> list[tuple[Any, Any]]:
     """Pairs of (Blender's handler list, function) that are registered."""
     lists = bpy.app.handlers
     after = [lists.save_post, lists.save_post_fail, lists.undo_post, lists.redo_post, lists.load_post]
-    return [(lists.save_pre, _restore), *((one, _agree) for one in after)]
+    return [(lists.save_pre, _restore), *((one, _update) for one in after)]
 
 
 def register() -> None:

@@ -221,7 +221,7 @@ _SECONDS: dict[str, Any] = {
     "min": 0.0,
     "soft_max": 20.0,
 }
-_BOTH: dict[str, Any] = {
+_EASE_BOTH: dict[str, Any] = {
     "name": "Ease",
     "description": "Frames in which the camera slows down, and in which it speeds up again",
     **_EASE,
@@ -243,7 +243,7 @@ class SPLANNEQUIN_OT_move_hold(_Stops, bpy.types.Operator):
 
     frame = IntProperty(**_FRAME)
     seconds = FloatProperty(**_SECONDS)
-    ease = IntProperty(**_BOTH)
+    ease = IntProperty(**_EASE_BOTH)
     smooth = FloatProperty(**_SMOOTH)
     fit_range = BoolProperty(**_FIT)
 
@@ -288,7 +288,7 @@ class SPLANNEQUIN_OT_move_orbit(_Stops, bpy.types.Operator):
         subtype="DISTANCE",
         options={"SKIP_SAVE"},
     )
-    ease = IntProperty(**_BOTH)
+    ease = IntProperty(**_EASE_BOTH)
     smooth = FloatProperty(**_SMOOTH)
     fit_range = BoolProperty(**_FIT)
 

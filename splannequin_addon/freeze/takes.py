@@ -157,8 +157,8 @@ def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
         return "Its overscan is not the one chosen now."
     if abs(take["shutter"] - params.shutter) > 1e-3:
         return "Its motion blur is not the one chosen now."
-    lacking = 0 if camera else take["frames_in_all"] - take["frame_count"]
-    return f"{lacking} of its {take['frames_in_all']} frames are not rendered yet." if lacking > 0 else ""
+    missing = 0 if camera else take["frames_in_all"] - take["frame_count"]
+    return f"{missing} of its {take['frames_in_all']} frames are not rendered yet." if missing > 0 else ""
 
 
 def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool:

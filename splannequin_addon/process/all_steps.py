@@ -67,7 +67,7 @@ def begin(scene: bpy.types.Scene, shot: Path) -> None:
     chain = _chains[shot] = Chain(remaining, contract.WholeWay(_expected(scene, shot, remaining)))
     if not bpy.app.background:
         _begin_next(chain, scene)
-        job_timer.meanwhile(lambda: _turn(shot, chain))
+        job_timer.call_until_false(lambda: _turn(shot, chain))
         return
     try:
         while chain.remaining:

@@ -22,7 +22,7 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
     Raises:
         contract.JobError: no shot is selected, there is no backend, or the shot cannot be written.
     """
-    selection.look_again()
+    selection.clear_cache()
     params = params or steps.STEPS[step].params(scene)
     folder = needed(scene, step)
     backend.python()  # fails before anything is written

@@ -51,8 +51,8 @@ class Part(Protocol):
 class Panel(Protocol):
     """Draws a step in the sidebar tab."""
 
-    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_at_hand: bool) -> None:
-        """Draws the header, and the body if it is open. `is_at_hand` marks the step to work on."""
+    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_current: bool) -> None:
+        """Draws the header, and the body if it is open. `is_current` marks the step to work on."""
 
 
 class Step:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _BEFORE = "splannequin_settings_before"
 _OURS = "splannequin_settings_ours"
-_TOGETHER = (
+_COUPLED = (
     {"resolution_x", "resolution_y", "resolution_percentage"},
     {"pixel_aspect_x", "pixel_aspect_y"},
     {"fps", "fps_base"},
@@ -66,20 +66,20 @@ def fit_clip(
     """
     render = scene.render
     changes: list[str] = []
-    spared = set[str]() if over else {name for names in _touched(scene).values() for name in names}
+    excluded = set[str]() if over else {name for names in _touched(scene).values() for name in names}
     aspect = axes.pixel_aspect(k) if k else (render.pixel_aspect_x, render.pixel_aspect_y)
     now = (render.resolution_x, render.resolution_y, render.resolution_percentage)
-    if size is not None and now != (*size, 100) and "resolution_x" not in spared:
+    if size is not None and now != (*size, 100) and "resolution_x" not in excluded:
         _set(scene, "render", {"resolution_x": size[0], "resolution_y": size[1], "resolution_percentage": 100})
         changes.append(f"Resolution set to {size[0]} x {size[1]}.")
-    if (render.pixel_aspect_x, render.pixel_aspect_y) != aspect and "pixel_aspect_x" not in spared:
+    if (render.pixel_aspect_x, render.pixel_aspect_y) != aspect and "pixel_aspect_x" not in excluded:
         _set(scene, "render", {"pixel_aspect_x": aspect[0], "pixel_aspect_y": aspect[1]})
         changes.append("Pixel aspect set to the lens's.")
-    if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4 and "fps" not in spared:
+    if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4 and "fps" not in excluded:
         whole = max(round(fps), 1)
         _set(scene, "render", {"fps": whole, "fps_base": whole / fps})
         changes.append(f"Frame rate set to {fps:g}.")
-    if (scene.frame_start, scene.frame_end) != frames and "frame_start" not in spared:
+    if (scene.frame_start, scene.frame_end) != frames and "frame_start" not in excluded:
         _set(scene, "scene", {"frame_start": frames[0], "frame_end": frames[1]})
         changes.append(f"Frame range set to {frames[0]} to {frames[1]}.")
     if not frames[0] <= scene.frame_current <= frames[1]:
@@ -211,7 +211,7 @@ def _touched(scene: bpy.types.Scene) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for owner, set_values in json.loads(scene.get(_OURS, "{}")).items():
         touched = {n for n, v in set_values.items() if not _same(getattr(_owner(scene, owner), n), v)}
-        for group in _TOGETHER:
+        for group in _COUPLED:
             touched |= group if touched & group else set()
         found[owner] = touched
     return found

@@ -328,12 +328,12 @@ def _read_typed(path: Path, kind: type, longest: int = contract.SHORT_JSON) -> d
     data = contract.read_json(path, longest)
     contract.check_version(data, str(path))
     try:
-        return _believed(kind, data)
+        return _validated(kind, data)
     except ValueError as error:
         raise contract.UserError(f"{path} is damaged: {str(error).lstrip('_')}.") from error
 
 
-def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
+def _validated(kind: type, data: dict[str, Any]) -> dict[str, Any]:
     names = [one.name for one in dataclasses.fields(kind) if one.name in data]
     parsed: object = contract.from_dict(kind, {name: data[name] for name in names})
     values = vars(parsed)
@@ -343,7 +343,7 @@ def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
         if isinstance(value, str) and name not in ("source", "camera_path"):
             values[name] = contract.printable(value)
     if isinstance(values.get("result"), dict):
-        values["result"] = _believed(_Solve, values["result"])
+        values["result"] = _validated(_Solve, values["result"])
     elif "result" in values:
         del values["result"]
     return {**data, **values}

@@ -114,7 +114,7 @@ def keep_camera(scene: bpy.types.Scene) -> None:
         settings_of(scene).camera_before = camera
 
 
-def give_camera_back(scene: bpy.types.Scene) -> None:
+def restore_camera(scene: bpy.types.Scene) -> None:
     """Sets the camera of a scene whose camera was removed with a shot: another shot's, or the one from before all
     shots."""
     props = settings_of(scene)
@@ -146,12 +146,12 @@ def tidy(scene: bpy.types.Scene) -> None:
                     kept.remove(index)
 
 
-def _is_in_scene(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:
-    """True if any scene has an object. Searches by name in the collections `among` first.
+def _is_in_scene(item: bpy.types.Object, collections: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:
+    """True if any scene has an object. Searches by name in the collections `collections` first.
 
     Called at every tick. `users_scene` copies the list of all objects of every scene, which may be tens of thousands.
     """
-    return any(named(objects, item.name) == item for objects in among) or bool(item.users_scene)
+    return any(named(objects, item.name) == item for objects in collections) or bool(item.users_scene)
 
 
 def remove_kept(

@@ -56,7 +56,7 @@ def folder_of_clip(clip: Path) -> Path:
     return found[1]
 
 
-def look_again() -> None:
+def clear_cache() -> None:
     """Clears the cache of `folder_of_clip`, because a shot may have been imported."""
     _clip_folders.clear()
 
@@ -84,10 +84,10 @@ def labels(scene: bpy.types.Scene) -> list[str]:
     ]
 
 
-def _parent_suffix(folder: Path, among: list[Path | None]) -> str:
-    """The shortest end of a folder's parent path that differs from all others in `among`; the whole path if there is
-    none."""
-    parents = [path.parent.parts for path in among if path is not None and path != folder]
+def _parent_suffix(folder: Path, candidates: list[Path | None]) -> str:
+    """The shortest end of a folder's parent path that differs from all others in `candidates`; the whole path if there
+    is none."""
+    parents = [path.parent.parts for path in candidates if path is not None and path != folder]
     parts = folder.parent.parts
     for count in range(1, len(parts)):
         if all(parent[-count:] != parts[-count:] for parent in parents):

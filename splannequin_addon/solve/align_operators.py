@@ -146,7 +146,7 @@ class _Aligns(OperatorBase):
             self.report({"ERROR"}, message)
             return {"CANCELLED"}
         stop()
-        _picking = self._mine = Picking(shot, xyz, self.count)
+        _picking = self._active = Picking(shot, xyz, self.count)
         _picking.handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
         context.window_manager.modal_handler_add(self)
         self._tell(context)
@@ -155,9 +155,9 @@ class _Aligns(OperatorBase):
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Handles events: a click selects a point, Backspace removes the last one, Esc or the right button cancels."""
         picked = _picking
-        root = cameras.find(scene_in(context), self._mine.shot, "EMPTY")
-        if picked is None or picked is not self._mine or root is None:  # superseded, or the shot was removed
-            if picked is self._mine:
+        root = cameras.find(scene_in(context), self._active.shot, "EMPTY")
+        if picked is None or picked is not self._active or root is None:  # superseded, or the shot was removed
+            if picked is self._active:
                 self.cancel(context)
             return {"CANCELLED"}
         pressed = event.value in {"PRESS", "DOUBLE_CLICK"}
@@ -204,7 +204,7 @@ class _Aligns(OperatorBase):
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Ends the clicking. Blender also calls this when another file is opened."""
-        if _picking is self._mine:
+        if _picking is self._active:
             stop()
         if context.workspace is not None:
             context.workspace.status_text_set(None)

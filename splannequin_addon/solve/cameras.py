@@ -92,7 +92,7 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
         pose = np.eye(4) if world else scene_from_solve(path, xyz, floor)
         mesh = _point_mesh(f"{name} points", xyz, rgb)
         kept = {n: item for n in ("camera", "points") if (item := _editable(scene, shot, n)) is not None}
-        _clear(scene, shot, but=("root", *kept))  # the root stays, with its children and transform
+        _clear(scene, shot, exclude=("root", *kept))  # the root stays, with its children and transform
         root = _root(scene, shot, pose, size)
         if present(scene_objects.of(scene, shot)).world != world:
             present(scene_objects.of(scene, shot)).world = world
@@ -201,23 +201,23 @@ def remove(scene: bpy.types.Scene, shot: Path) -> bool:
     _clear(scene, shot)
     scene_objects.drop(scene, shot)
     if was and ours:
-        scene_objects.give_camera_back(scene)
+        scene_objects.restore_camera(scene)
     return True
 
 
-def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> None:
+def _clear(scene: bpy.types.Scene, shot: Path, exclude: tuple[str, ...] = ()) -> None:
     """Removes the objects of a shot, except for the named parts. With any named part, the collection also stays."""
     entry = scene_objects.of(scene, shot)
     if entry is None:
         return
     guesses.unmark(scene, shot)
-    for item in [getattr(entry, name) for name in scene_objects.PARTS if name not in but]:
+    for item in [getattr(entry, name) for name in scene_objects.PARTS if name not in exclude]:
         if item is None or (item.users_scene and scene not in item.users_scene):
             continue
         for child in [c for c in item.children if c not in [getattr(entry, name) for name in scene_objects.PARTS]]:
-            stood = child.matrix_world.copy()
+            matrix = child.matrix_world.copy()
             child.parent = None
-            child.matrix_world = stood
+            child.matrix_world = matrix
         data, images = item.data, []
         actions = [b.animation_data.action for b in (item, data) if b is not None and b.animation_data]
         if item.type == "CAMERA":
@@ -227,7 +227,7 @@ def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> Non
         bpy.data.batch_remove(unused)
         bpy.data.batch_remove([i for i in images if i.users == 0])
     collection = entry.collection
-    if but or collection is None:
+    if exclude or collection is None:
         return
     for item in [o for o in collection.objects if o.users_collection == (collection,)]:
         scene.collection.objects.link(item)

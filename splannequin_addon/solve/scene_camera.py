@@ -43,14 +43,14 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
     samples: list[camera_samples.Sample] = []
     with seen_camera.frame_kept(uid):
         for number in numbers:
-            seen = seen_camera.evaluated(session.scene_of(uid), name, number, size, camera_samples.ANOTHER)
+            seen = seen_camera.evaluated(session.scene_of(uid), name, number, size, camera_samples.MOVING_CAMERA_HINT)
             samples.append(camera_samples.sample_of(number, seen[0], seen[1], size))
             del seen
             yield len(samples), len(numbers)
     if not camera_samples.moves(samples):
         raise contract.JobError(
             f"{name} stands still from frame {numbers[0]} to {numbers[-1]}.",
-            camera_samples.ANOTHER,
+            camera_samples.MOVING_CAMERA_HINT,
             contract.ExitCode.USAGE,
         )
     found = session.scene_of(uid)

@@ -34,7 +34,7 @@ def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Pla
     stored = finished or paused
     if stored is None:
         return Plan("train", "Train", "")
-    if _goes_on(stored, preset, depth):
+    if _can_resume_anew(stored, preset, depth):
         words = "Paused while the run was trained anew. The run is as it was until the new one is done."
         return Plan("resume", "Resume", words)
     if stored.get("has_new_cameras"):
@@ -59,7 +59,7 @@ def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Pla
     return Plan("extend", "Train On", "Adds these steps to the run. It stays as it is until all are done.")
 
 
-def _goes_on(stored: dict[str, Any], preset: str, depth: str) -> bool:
+def _can_resume_anew(stored: dict[str, Any], preset: str, depth: str) -> bool:
     """True if the run's repeated training has this preset, these depth maps and the shot's current cameras."""
     anew = stored.get("anew")
     return (
@@ -80,7 +80,7 @@ def params(
     if state is not None and kind == "resume":
         # Use the run's settings, not the panel's, so that a run started on the command line also resumes.
         stored = state.runs.get(run) or state.unfinished[run]
-        begun = stored["anew"] if _goes_on(stored, preset, depth) else stored
+        begun = stored["anew"] if _can_resume_anew(stored, preset, depth) else stored
         settings = checkpoints.params_of(begun["config"])
         return contract.TrainParams(run=run, device=device, depth=begun.get("depth_source", ""), **settings)
     extend = 0

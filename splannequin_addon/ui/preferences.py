@@ -92,7 +92,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
             if ours:
                 row.operator("splannequin.remove_backend", icon="TRASH")
         if _setup is not None:
-            for line in _setup.said if _setup.running else []:
+            for line in _setup.output if _setup.running else []:
                 self._say(box, line)
             if _setup.failure:
                 column = box.column(align=True)
@@ -196,7 +196,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
             return {"CANCELLED"}
         _findings.clear()
         if not bpy.app.background:
-            job_timer.meanwhile(_follow_setup)
+            job_timer.call_until_false(_follow_setup)
             return {"FINISHED"}
         if _setup.process is not None:
             _setup.process.wait()

@@ -159,9 +159,9 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
         if len(settings_of(scene_in(context)).shots) > 1:
             self._list(context, layout)
         self._all_steps(context, layout)
-        at_hand = folds.at_hand(scene_in(context))
+        current_step = folds.current_step(scene_in(context))
         for name, step in steps.STEPS.items():
-            step.panel.draw(context, layout, name == at_hand)
+            step.panel.draw(context, layout, name == current_step)
 
     def _all_steps(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Draws the button that runs all remaining steps up to the freeze, or their progress."""
