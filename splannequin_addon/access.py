@@ -60,8 +60,8 @@ def layout_of(drawn: _Drawn) -> bpy.types.UILayout:
 
 def settings_of(scene: bpy.types.Scene) -> SPLANNEQUIN_PG_scene:
     """The artist's settings of a scene."""
-    held: Any = scene
-    return held.splannequin
+    untyped: Any = scene
+    return untyped.splannequin
 
 
 def named(things: bpy.types.bpy_prop_collection[T], name: str) -> T | None:

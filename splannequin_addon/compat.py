@@ -38,16 +38,16 @@ if "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties:
 
 def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree | None:
     """The scene's compositor tree, or None if it has none."""
-    return scene.compositing_node_group if HAS_COMPOSITING_GROUP else _own_tree(scene)
+    return scene.compositing_node_group if HAS_COMPOSITING_GROUP else _scene_node_tree(scene)
 
 
-def own_compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+def single_user_compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     """The scene's compositor tree, copied first if another scene shares it (5.0 on). The scene must have a tree."""
     if not HAS_COMPOSITING_GROUP:
-        return _own_tree(scene)
+        return _scene_node_tree(scene)
     tree = scene.compositing_node_group
     assert tree is not None
-    sharing = [other for other in bpy.data.scenes if other != scene and other.compositing_node_group == tree]
+    sharing = [user for user in bpy.data.scenes if user != scene and user.compositing_node_group == tree]
     if not sharing:
         return tree
     fresh = scene.compositing_node_group = tree.copy()
@@ -57,7 +57,7 @@ def own_compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     return fresh
 
 
-def _own_tree(scene: Any) -> bpy.types.NodeTree:
+def _scene_node_tree(scene: Any) -> bpy.types.NodeTree:
     """The scene's compositor tree before 5.0. The type stubs of newer versions lack it."""
     return scene.node_tree
 
@@ -93,7 +93,7 @@ def new_compositor_tree(scene: bpy.types.Scene, name: str) -> bpy.types.NodeTree
     """A new tree with an output node, assigned to the scene. Only for a scene without a tree."""
     if not HAS_COMPOSITING_GROUP:
         scene.use_nodes = True
-        tree = _own_tree(scene)
+        tree = _scene_node_tree(scene)
         tree.nodes.clear()
         tree.nodes.new("CompositorNodeComposite")
         return tree
@@ -107,7 +107,7 @@ def new_compositor_tree(scene: bpy.types.Scene, name: str) -> bpy.types.NodeTree
 def drop_compositor_tree(scene: bpy.types.Scene) -> None:
     """Removes the tree that `new_compositor_tree` made."""
     if not HAS_COMPOSITING_GROUP:
-        _own_tree(scene).nodes.clear()
+        _scene_node_tree(scene).nodes.clear()
         scene.use_nodes = False
         return
     tree = scene.compositing_node_group

@@ -79,7 +79,7 @@ def register() -> None:
         properties.annotate(cls)
     undo: list[Callable[[], None]] = []
     try:
-        for begin, end in _acts():
+        for begin, end in _registrations():
             undo.append(end)  # before the call, to undo a partial registration
             begin()
     except Exception as error:
@@ -93,10 +93,10 @@ def register() -> None:
 def unregister() -> None:
     """Undoes `register` in reverse order. An error in one part does not stop the others."""
     if registered():
-        _undo([end for _, end in _acts()])
+        _undo([end for _, end in _registrations()])
 
 
-def _acts() -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
+def _registrations() -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
     """Pairs of (register, unregister) functions, in order."""
     for part in _PARTS:
         yield part.register, part.unregister
@@ -106,12 +106,12 @@ def _acts() -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
         yield part.register, part.unregister
 
 
-def _undo(acts: Sequence[Callable[[], None]]) -> None:
+def _undo(calls: Sequence[Callable[[], None]]) -> None:
     """Unregisters parts in reverse order, then everything else that this add-on left registered after partial
     failures."""
-    for act in reversed(acts):
+    for call in reversed(calls):
         with contextlib.suppress(Exception):
-            act()
+            call()
     for name in dir(bpy.app.handlers):
         hooks: Any = getattr(bpy.app.handlers, name)
         if isinstance(hooks, list):

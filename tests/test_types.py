@@ -15,11 +15,11 @@ OPEN = {
     "bake/render_settings.py: _picture(value)": "the value of any setting",
     "bake/render_settings.py: _set(owner)": "whatever has settings",
     "bake/render_settings.py: set_noted(value)": "the value of any setting",
-    "compat.py: _own_tree(scene)": "a Blender older than its types",
+    "compat.py: _scene_node_tree(scene)": "a Blender older than its types",
     "process/children.py: start(streams)": "what Popen takes, by name",
     "scene/scene_setup.py: _neutral(view)": "Blender's types know the views of one colour configuration",
-    "scene/scene_setup.py: _same(one)": "the value of any setting",
-    "scene/scene_setup.py: _same(other)": "the value of any setting",
+    "scene/scene_setup.py: _same(first)": "the value of any setting",
+    "scene/scene_setup.py: _same(second)": "the value of any setting",
     "scene/sequences.py: show_sequence(user)": "an image user, or a node that has the same in itself",
 }
 """Map from each parameter of type `Any` to the reason."""

@@ -23,7 +23,7 @@ TOLERANCE_PX = 0.5
 """Largest allowed distance, in pixels of the render, between the projections of a scene point by the two cameras."""
 
 
-def is_led_in(scene: bpy.types.Scene) -> bool:
+def is_cg_linked(scene: bpy.types.Scene) -> bool:
     """True if a render of the scene is linked to the freeze group's CG input."""
     return bool(_layers(scene))
 
@@ -76,7 +76,7 @@ def difference(scene: bpy.types.Scene, take: Path, frames: Sequence[int], camera
                 seen = seen_camera.sampled(scene, camera, shot, number, size)
             except contract.JobError as error:
                 return error.message
-            away = _pixels_apart(seen, known[number], size, (path.width, path.height), depth)
+            away = _pixel_distance(seen, known[number], size, (path.width, path.height), depth)
             if not away <= TOLERANCE_PX:
                 name = camera or (scene.camera.name if scene.camera is not None else "")
                 pixels = min(away, 9999.0)  # infinite if the camera looks away
@@ -122,9 +122,9 @@ def use_matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int
 def seen_from(shot: Path, take: str) -> contract.CameraPath:
     """The camera path of a take: the clip's or the artist's. Raises JobError if it is no longer known."""
     facts = inventory.read(shot).takes.get(take, {})
-    own = seen_camera.path_of(shot, facts)
+    file = seen_camera.path_of(shot, facts)
     try:
-        path = contract.CameraPath.load(own or contract.ShotFolder(shot).cameras)
+        path = contract.CameraPath.load(file or contract.ShotFolder(shot).cameras)
         if path.frames:
             return path
     except (OSError, ValueError):
@@ -146,7 +146,7 @@ def _layers(scene: bpy.types.Scene) -> list[Any]:
     return found
 
 
-def _pixels_apart(
+def _pixel_distance(
     seen: contract.CameraFrame,
     wanted: contract.CameraFrame,
     size: tuple[int, int],
@@ -169,9 +169,9 @@ def _pixels_apart(
     fx, fy, cx, cy = larger * fx, larger * fy, larger * cx, 0.5 * height + larger * (cy - 0.5 * taken[1])
     us, vs = (np.array([0.5, 0.0, 1.0, 0.0, 1.0]) * width, np.array([0.5, 0.0, 0.0, 1.0, 1.0]) * height)
     points = depth * np.stack([(us - cx) / fx, (vs - cy) / fy, np.ones(5)])
-    one, other = (np.array(frame.viewmat, dtype=np.float64).reshape(4, 4) for frame in (seen, wanted))
-    world = other[:3, :3].T @ (points - other[:3, 3:])
-    x, y, z = one[:3, :3] @ world + one[:3, 3:]
+    seen_viewmat, wanted_viewmat = (np.array(frame.viewmat, dtype=np.float64).reshape(4, 4) for frame in (seen, wanted))
+    world = wanted_viewmat[:3, :3].T @ (points - wanted_viewmat[:3, 3:])
+    x, y, z = seen_viewmat[:3, :3] @ world + seen_viewmat[:3, 3:]
     if z.min() <= 0.0:
         return float("inf")  # behind the camera
     u, v = seen.K[0] * x / z + seen.K[2], seen.K[1] * y / z + seen.K[3]

@@ -27,7 +27,7 @@ from .take_files import Take
 
 _CG = "cg"
 """Tag value of our Render Layers node, which is not part of the plate's stream."""
-_HOW = "splannequin_how"
+_FIT_MODE = "splannequin_how"
 """Property of the plate's Scale node: the fit that we set last. A fit set by the artist stays until the plate or the
 scene changes shape."""
 _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
@@ -63,14 +63,14 @@ def insert(
         ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is unchanged.
     """
     changes: list[str] = []
-    _need_own(compat.compositor_tree(scene))
+    _require_local(compat.compositor_tree(scene))
     behind = placing.place_of(scene, footage, where)
     wanted = freeze_group.wants_warp(scene) if warp is None else warp
     frozen, flow, stream = _frozen_image(take), _warp_image(take) if wanted else None, None
     if plate is not None and freeze_group.shows_plate(scene):
         stream = original_plate.plate_of(take, _shot_of(take), plate)
     if compat.compositor_tree(scene) is not None:  # all checks have passed
-        freeze_group.own_tree(scene)
+        freeze_group.single_user_tree(scene)
         behind = placing.place_of(scene, footage, where)
     enabled = compat.compositor_enabled(scene)
     before = {**compat.compositor_switches(scene), "made_tree": False}
@@ -86,11 +86,11 @@ def insert(
     node, done = _placed(tree, before, behind, where)
     changes += done
     changes += freeze_group.switch_warp(node, wanted, flow is not None)
-    changes += freeze_group.give_passes(node, _layers_of(frozen, take))
+    changes += freeze_group.update_passes(node, _layers_of(frozen, take))
     group_inside.fill(scene, node, take, frozen, flow)
-    changes += freeze_group.lacking(node)
+    changes += freeze_group.missing_layers(node)
     if stream is not None:
-        changes += stream.said if _show_plate(scene, tree, node, stream, take) else []
+        changes += stream.remarks if _show_plate(scene, tree, node, stream, take) else []
     return changes
 
 
@@ -104,19 +104,19 @@ def _placed(
     node = freeze_group.group_node(tree)
     if node is None:
         node = freeze_group.new_node(tree, before)
-        placing.lead_through(tree, node, behind)
+        placing.route_through(tree, node, behind)
         place = "as the plate: what follows it goes on from there" if behind is not None else "before the output"
         return node, [f'The node group "{GROUP_NAME}" was inserted {place}.']
     changes: list[str] = []
-    if where != "AUTO" and placing.stands_in(node) != (behind is not None):
-        placing.lead_past(tree, node)
-        placing.lead_through(tree, node, behind)
+    if where != "AUTO" and placing.is_behind_plate(node) != (behind is not None):
+        placing.bypass(tree, node)
+        placing.route_through(tree, node, behind)
         changes.append(f'The node group "{GROUP_NAME}" was moved.')
-    freeze_group.set_defaults(node, freeze_group.give_sockets(present(node.node_tree)))
+    freeze_group.set_defaults(node, freeze_group.add_sockets(present(node.node_tree)))
     return node, [*changes, f'The node group "{GROUP_NAME}" was updated.']
 
 
-def _need_own(tree: bpy.types.NodeTree | None) -> None:
+def _require_local(tree: bpy.types.NodeTree | None) -> None:
     """Raises JobError if the compositor is linked from another file: changes would be lost when this file is
     reopened."""
     library = library_of(tree) if tree is not None else None
@@ -175,7 +175,7 @@ def may_combine_cg(scene: bpy.types.Scene) -> bpy.types.CompositorNodeGroup:
     Raises JobError without the group, or if its CG input is already linked.
     """
     tree = compat.compositor_tree(scene)
-    _need_own(tree)
+    _require_local(tree)
     node = freeze_group.group_node(tree) if tree else None
     if node is None:
         raise contract.JobError("The freeze is not in this compositor.", "Bake first.", contract.ExitCode.BAKE)
@@ -194,7 +194,7 @@ def combine_cg(scene: bpy.types.Scene) -> list[str]:
     The view layer must have its depth pass. Raises JobError as `may_combine_cg` does.
     """
     may_combine_cg(scene)
-    tree = freeze_group.own_tree(scene)
+    tree = freeze_group.single_user_tree(scene)
     node = present(freeze_group.group_node(tree))
     layers: Any = tree.nodes.new("CompositorNodeRLayers")
     layers[TAG] = _CG
@@ -212,11 +212,11 @@ def remove(scene: bpy.types.Scene) -> bool:
     node = freeze_group.group_node(tree) if tree else None
     if tree is None or node is None or library_of(tree):
         return False
-    tree = freeze_group.own_tree(scene)
+    tree = freeze_group.single_user_tree(scene)
     node = present(freeze_group.group_node(tree))
     group = present(node.node_tree)
     before = json.loads(group.get(freeze_group.BEFORE, "{}"))
-    placing.lead_past(tree, node)
+    placing.bypass(tree, node)
     images = [n.image for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
     textures = [t for n in group.nodes if n.bl_idname == "CompositorNodeTexture" and (t := getattr(n, "texture", None))]
     tree.nodes.remove(node)
@@ -236,7 +236,7 @@ def remove(scene: bpy.types.Scene) -> bool:
     return True
 
 
-def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Iterator[None]:
+def prefetch(take: Take, plate: Path | None = None, warp: bool = False) -> Iterator[None]:
     """Loads the images that `insert` needs, one per iteration. Blender's window is blocked while it loads an image."""
     wanted: list[tuple[Path, str, sequences.Encoding]] = [
         (numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", take.light)
@@ -247,7 +247,7 @@ def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Ite
         sequences.read(path, name, encoding, take.first, take.last)
         yield
     if plate is not None:
-        yield from original_plate.read_ahead(take, _shot_of(take), plate)
+        yield from original_plate.prefetch(take, _shot_of(take), plate)
 
 
 def _warp_picture(take: Take) -> tuple[Path, str, sequences.Encoding]:
@@ -273,9 +273,9 @@ def _show_plate(
     """
     ours, before = _stream_of(tree, node), placing.links_of(node.inputs["Image"])
     reader = next((n for n in ours if isinstance(n, bpy.types.CompositorNodeImage)), None)
-    others = before and before[0].from_node not in ours if reader is None else _is_others(reader.image)
-    stale = [] if others else _images(ours)
-    if not others:
+    is_foreign = before and before[0].from_node not in ours if reader is None else _is_foreign(reader.image)
+    stale = [] if is_foreign else _images(ours)
+    if not is_foreign:
         if reader is None:
             for old in ours:
                 original_plate.drop(old)
@@ -284,19 +284,19 @@ def _show_plate(
             sequences.show_sequence(reader, plate.image, take.first, take.last, plate.shift)
             _follow_plate(scene, tree, node, reader, ours, plate)
     for image in {i.name: i for i in [*stale, plate.image, plate.map] if i is not None}.values():
-        if image.users == 0 and not _is_others(image):
+        if image.users == 0 and not _is_foreign(image):
             bpy.data.images.remove(image)
-    return not others
+    return not is_foreign
 
 
 def _stream_of(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> list[bpy.types.Node]:
     """Our nodes of the plate's stream. Copies of them carry the same tag, so nodes upstream of the group come first."""
     marked = [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]
-    led = placing.upstream(node)
-    return sorted(marked, key=lambda n: n not in led)
+    sources = placing.upstream(node)
+    return sorted(marked, key=lambda n: n not in sources)
 
 
-def _is_others(image: bpy.types.Image | None) -> bool:
+def _is_foreign(image: bpy.types.Image | None) -> bool:
     return image is not None and not image.get(TAG)
 
 
@@ -340,8 +340,8 @@ def _follow_plate(
         original_plate.refill(inner, plate)
         stream = inner.outputs[0]
     elif inner is not None or wanted:
-        beside = (inner or fit or node).location
-        place = (beside.x - (0 if inner else GAP if fit else 2 * GAP), beside.y)
+        anchor = (inner or fit or node).location
+        place = (anchor.x - (0 if inner else GAP if fit else 2 * GAP), anchor.y)
         targets = [present(k.to_socket) for k in placing.links_of(stream if inner is None else inner.outputs[0])]
         if inner is not None:
             stream = next((present(k.from_socket) for k in placing.links_of(inner.inputs[0])), stream)
@@ -349,16 +349,16 @@ def _follow_plate(
         stream = original_plate.through(tree, stream, plate, place)
         for target in targets:
             tree.links.new(stream, target)
-    how, led = fitting.how_it_fits(scene, plate.size), node.inputs["Image"]
-    if fit is None and not led.is_linked:
-        fit = compat.new_fit_node(tree, how)
-        fit[TAG], fit[_HOW] = True, how
+    mode, image_input = fitting.fit_mode(scene, plate.size), node.inputs["Image"]
+    if fit is None and not image_input.is_linked:
+        fit = compat.new_fit_node(tree, mode)
+        fit[TAG], fit[_FIT_MODE] = True, mode
         fit.label = "Fit Plate"
         fit.location = (node.location.x - GAP, node.location.y)
-    elif fit is not None and fit.get(_HOW) != how:
-        compat.set_fit(fit, how)
-        fit[_HOW] = how
+    elif fit is not None and fit.get(_FIT_MODE) != mode:
+        compat.set_fit(fit, mode)
+        fit[_FIT_MODE] = mode
     if fit is not None and not fit.inputs[0].is_linked:
         tree.links.new(stream, fit.inputs[0])
-    if fit is not None and not led.is_linked:
-        tree.links.new(fit.outputs[0], led)
+    if fit is not None and not image_input.is_linked:
+        tree.links.new(fit.outputs[0], image_input)

@@ -101,11 +101,11 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _tell(shot: Path, asked: children.Question) -> None:
+def _tell(shot: Path, question: children.Question) -> None:
     """Shows the result of an export on the panel."""
     watch = job_timer.watch_of(shot)
     try:
-        watch.notes["bake"] = farm_job.written(asked)
+        watch.notes["bake"] = farm_job.written(question)
     except contract.JobError as error:
         watch.failures["bake"] = (error.message, error.hint)
 

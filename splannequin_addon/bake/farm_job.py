@@ -40,6 +40,6 @@ def begin(words: contract.FarmWords, requests: dict[str, Any]) -> children.Quest
     return backend.ask("farm", *contract.arguments_of(words), *device)
 
 
-def written(asked: children.Question) -> list[str]:
+def written(question: children.Question) -> list[str]:
     """The backend's report on the job it wrote, line by line. Raises JobError with the backend's message on failure."""
-    return [line.rstrip() for line in asked.answer("{}").splitlines() if line.strip()]
+    return [line.rstrip() for line in question.answer("{}").splitlines() if line.strip()]

@@ -87,10 +87,10 @@ def fitted(
         node.location = (-2 * GAP, -50.0 - 170.0 * row)
         group.links.new(sockets[name], node.inputs[0])
         sockets[name] = node.outputs[0]
-    how, shown = how_it_fits(scene, size), _whole(group, sockets["Depth"])
+    mode, shown = fit_mode(scene, size), _whole(group, sockets["Depth"])
     coverage = None
     for row, name in enumerate(("", *names) if shown is not None else names):
-        node = compat.new_fit_node(group, how)
+        node = compat.new_fit_node(group, mode)
         node.label = f"Fit {name}" if name else "Fit what there is"
         node.location = (-GAP, 150.0 - 170.0 * row)
         group.links.new(sockets[name] if name or shown is None else shown, node.inputs[0])
@@ -101,7 +101,7 @@ def fitted(
     return sockets
 
 
-def how_it_fits(scene: bpy.types.Scene, size: tuple[int, int]) -> str:
+def fit_mode(scene: bpy.types.Scene, size: tuple[int, int]) -> str:
     """How to fit an image of a size into the render: the widths match, as in the solved camera."""
     tall = scene.render.resolution_x * size[1] / (scene.render.resolution_y * size[0])
     # With equal aspect ratios up to rounding, both modes work. Then use "Fit" where cropping leaves a row unset.

@@ -44,7 +44,7 @@ def wants_warp(scene: bpy.types.Scene) -> bool:
     return node is not None and bool(present(node.node_tree).get(_WARPS))
 
 
-def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
+def missing_layers(node: bpy.types.CompositorNodeGroup) -> list[str]:
     """A sentence for each setting of our node whose layers the take lacks."""
     inside, remarks = present(node.node_tree).nodes, list[str]()
     if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
@@ -97,23 +97,23 @@ def cg_softness(scene: bpy.types.Scene) -> bpy.types.NodeSocket | None:
 
 def set_depth_scale(scene: bpy.types.Scene, scale: float) -> None:
     """Sets the depth factor of the freeze group. Call it only if `shown` returns a take."""
-    node = present(group_node(own_tree(scene)))
+    node = present(group_node(single_user_tree(scene)))
     set_value(present(node.node_tree).nodes[DEPTH].inputs[1], scale)
 
 
-def own_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+def single_user_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     """The scene's compositor tree. Afterwards no other scene shares this tree or our group.
 
     A copied scene shares our group, and since Blender 5.0 a linked copy shares the whole tree. A change for one scene
     would change the other, so shared data is copied. The scene must have a tree.
     """
-    tree = compat.own_compositor_tree(scene)
+    tree = compat.single_user_compositor_tree(scene)
     nodes = [n for n in tree.nodes if isinstance(n, bpy.types.CompositorNodeGroup) and _is_ours(n.node_tree)]
     for group in {present(n.node_tree) for n in nodes}:
-        here = [n for n in nodes if n.node_tree == group]
-        if group.users - int(group.use_fake_user) > len(here):
+        instances = [n for n in nodes if n.node_tree == group]
+        if group.users - int(group.use_fake_user) > len(instances):
             fresh = group.copy()
-            for node in here:
+            for node in instances:
                 node.node_tree = fresh
     return tree
 
@@ -146,16 +146,16 @@ def _factor(socket: Any, value: float) -> None:
     socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
 
 
-def give_sockets(group: bpy.types.NodeTree) -> set[str]:
+def add_sockets(group: bpy.types.NodeTree) -> set[str]:
     """Adds the missing sockets to a group; sockets of an older version stay. Returns the names of new inputs."""
     existing = {(i.in_out, i.name) for i in compat.sockets_of(group)}
-    given: set[str] = set()
+    added: set[str] = set()
 
     def new(name: str, side: str, kind: str, text: str) -> Any:
         if (side, name) in existing:
             return None
         if side == "INPUT":
-            given.add(name)
+            added.add(name)
         return compat.new_socket(group, name, side, kind, text)
 
     new("Image", "INPUT", "NodeSocketColor", "Your stream, up to here")
@@ -177,10 +177,10 @@ def give_sockets(group: bpy.types.NodeTree) -> set[str]:
         soft.default_value, soft.min_value, soft.subtype = 0.0, 0.0, "DISTANCE"
     for layer in _OUT:
         new(layer.output, "OUTPUT", layer.socket, layer.tip)
-    return given
+    return added
 
 
-def give_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[str]:
+def update_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[str]:
     """Adds the outputs of the take's passes to our node, and removes the outputs of missing passes.
 
     A linked output stays even if its pass is missing. Returns a sentence for each such output.
@@ -220,7 +220,7 @@ def new_node(tree: bpy.types.NodeTree, before: dict[str, bool]) -> bpy.types.Com
     assert isinstance(group, bpy.types.CompositorNodeTree)
     group[TAG] = True
     group[BEFORE] = json.dumps(before)
-    give_sockets(group)
+    add_sockets(group)
     node = tree.nodes.new("CompositorNodeGroup")
     assert isinstance(node, bpy.types.CompositorNodeGroup)
     node.node_tree = group

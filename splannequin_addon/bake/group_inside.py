@@ -63,8 +63,8 @@ def fill(
     nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0], enter.outputs[SOFTNESS])
     group.links.new(share, factor)
     # CG is in both inputs: Mix, Wipe and the mattes choose between stream and frozen frame but do not hide CG.
-    group.links.new(_among(group, enter, enter.outputs["Image"], nearer, "CG in your stream"), first)
-    group.links.new(_among(group, enter, _grainy(group, enter, fitted), nearer, "CG among the frozen"), second)
+    group.links.new(_insert_cg(group, enter, enter.outputs["Image"], nearer, "CG in your stream"), first)
+    group.links.new(_insert_cg(group, enter, _grainy(group, enter, fitted), nearer, "CG among the frozen"), second)
     group.links.new(mixed, leave.inputs["Image"])
     group.links.new(fitted["Depth"], depth.inputs[0])
     group.links.new(depth.outputs[0], leave.inputs["Depth"])
@@ -82,7 +82,11 @@ def fill(
 
 
 def _warped(
-    group: bpy.types.NodeTree, enter: bpy.types.Node, own: bpy.types.NodeSocket, image: bpy.types.Image, take: Take
+    group: bpy.types.NodeTree,
+    enter: bpy.types.Node,
+    frame_socket: bpy.types.NodeSocket,
+    image: bpy.types.Image,
+    take: Take,
 ) -> bpy.types.NodeSocket:
     """Socket of the frozen image: the take's frames, or the group's input frozen by the take's warp."""
     reader = group.nodes.new("CompositorNodeImage")
@@ -93,7 +97,7 @@ def _warped(
     node, factor, first, second, mixed = compat.new_mix_node(group)
     node.label, node.location = AS_WARP, (-2 * GAP, 330.0)
     group.links.new(enter.outputs[AS_WARP], factor)
-    group.links.new(own, first)
+    group.links.new(frame_socket, first)
     group.links.new(frozen, second)
     return mixed
 
@@ -139,7 +143,7 @@ def _grainy(
     return summed
 
 
-def _among(
+def _insert_cg(
     group: bpy.types.NodeTree,
     enter: bpy.types.Node,
     picture: bpy.types.NodeSocket,
@@ -257,22 +261,24 @@ def _share(
     total = _product(group, enter.outputs["Mix"], left.outputs[0])
     for row, (name, layer) in enumerate((("Only Supported", "Support"), ("Only Moving", "Motion"))):
         # 1 - amount * (1 - matte)
-        lacking = compat.new_math_node(group, "SUBTRACT")
-        lacking.inputs[0].default_value = 1.0
-        group.links.new(layers[layer], lacking.inputs[1])
-        removed = _product(group, enter.outputs[name], lacking.outputs[0])
+        complement = compat.new_math_node(group, "SUBTRACT")
+        complement.inputs[0].default_value = 1.0
+        group.links.new(layers[layer], complement.inputs[1])
+        removed = _product(group, enter.outputs[name], complement.outputs[0])
         kept = compat.new_math_node(group, "SUBTRACT")
         kept.inputs[0].default_value = 1.0
         group.links.new(removed, kept.inputs[1])
         total = _product(group, total, kept.outputs[0])
-        lacking.location, kept.location = (-2 * GAP, 500.0 + 170.0 * row), (-GAP, 500.0 + 170.0 * row)
+        complement.location, kept.location = (-2 * GAP, 500.0 + 170.0 * row), (-GAP, 500.0 + 170.0 * row)
     left.location = (-GAP, 330.0)
     return total
 
 
-def _product(group: bpy.types.NodeTree, one: bpy.types.NodeSocket, other: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+def _product(
+    group: bpy.types.NodeTree, first: bpy.types.NodeSocket, second: bpy.types.NodeSocket
+) -> bpy.types.NodeSocket:
     node = compat.new_math_node(group)
     node.location = (0.0, 330.0)
-    group.links.new(one, node.inputs[0])
-    group.links.new(other, node.inputs[1])
+    group.links.new(first, node.inputs[0])
+    group.links.new(second, node.inputs[1])
     return node.outputs[0]

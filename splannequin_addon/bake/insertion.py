@@ -36,21 +36,21 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
         _need_warp(shot, frozen)
     footage = _footage(scene, shot, plate)
     changes = compositor.insert(scene, frozen, plate, footage, settings_of(scene).insert_at, warp)
-    lacking = inventory.missing_frames(shot, take, rendering.frames_of(scene))
-    if cg_camera.is_led_in(scene):
+    missing = inventory.missing_frames(shot, take, rendering.frames_of(scene))
+    if cg_camera.is_cg_linked(scene):
         numbers = rendering.frames_of(scene)
         wrong = cg_camera.difference(scene, frozen.folder, [numbers[0], numbers[-1]]) if numbers else ""
         changes += [wrong] if wrong else []
-    if lacking:
-        changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
+    if missing:
+        changes.append(f"{len(missing)} frames of the scene's range are not in the take, the first is {missing[0]}.")
     return changes
 
 
-def read_ahead(scene: bpy.types.Scene, shot: Path, take: str) -> Iterator[None]:
+def prefetch(scene: bpy.types.Scene, shot: Path, take: str) -> Iterator[None]:
     """Loads the images that `insert` will need, one per iteration. Raises JobError as `insert` does."""
     frozen, plate = _sources(scene, shot, take)
     shown = plate if freeze_group.shows_plate(scene) else None
-    return compositor.read_ahead(frozen, shown, freeze_group.wants_warp(scene))
+    return compositor.prefetch(frozen, shown, freeze_group.wants_warp(scene))
 
 
 def _need_warp(shot: Path, take: Take) -> None:
@@ -187,7 +187,7 @@ def _turns(scene_uid: int, shot: Path, take: str, only: int) -> Iterator[None]:
     with contextlib.suppress(
         contract.JobError, OSError, RuntimeError, ValueError
     ):  # `insert_freeze` reports the same error
-        yield from read_ahead(present(session.scene_of(scene_uid)), shot, take)
+        yield from prefetch(present(session.scene_of(scene_uid)), shot, take)
     seen = 0
 
     def put_in(scene: bpy.types.Scene) -> list[str]:

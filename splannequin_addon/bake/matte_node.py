@@ -30,7 +30,7 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
         raise contract.JobError(
             "This scene has no compositor of its own.", "Bake, or make one, first.", contract.ExitCode.BAKE
         )
-    tree = compat.own_compositor_tree(scene)
+    tree = compat.single_user_compositor_tree(scene)
     image = sequences.load_numbers(folder.cryptomatte(frames[0]), f"Mattes {take}")
     if image.source != "SEQUENCE":
         size_of(image)  # loads the image: Blender 4.2 selects no matte from a sequence whose first image is not loaded
@@ -41,9 +41,9 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
     node.label, node.source = f"Matte {name}", "IMAGE"
     sequences.show_sequence(node, image, frames[0], frames[-1])
     node.matte_id = _quoted(name)
-    others = [other for other in tree.nodes if other != node]
-    left = min((other.location.x for other in others), default=0.0)
-    low = min((other.location.y - other.height for other in others), default=0.0)
+    existing = [item for item in tree.nodes if item != node]
+    left = min((item.location.x for item in existing), default=0.0)
+    low = min((item.location.y - item.height for item in existing), default=0.0)
     node.location = left, low - 200.0
     return [f"The node Matte {name} was added: link its output Matte."]
 

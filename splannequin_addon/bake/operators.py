@@ -69,7 +69,7 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
         except RuntimeError as error:
             run.refused(error)
         run.finish(scene)
-        return notes + run.said
+        return notes + run.notes
 
 
 class SPLANNEQUIN_OT_render(bpy.types.Operator):
@@ -113,7 +113,7 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
         if run.error is not None or (how == "EXEC_DEFAULT" and "bake" in job_timer.watch_of(folder).failures):
             self.report({"ERROR"}, tr(" ".join(job_timer.watch_of(folder).failures["bake"])))
             return {"CANCELLED"}
-        for note in (*notes, *run.said):
+        for note in (*notes, *run.notes):
             self.report({"INFO"}, tr(note))
         return {"FINISHED"}
 

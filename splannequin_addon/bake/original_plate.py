@@ -26,7 +26,7 @@ LENS = "Splannequin Undistort"
 """Name of the group that removes the lens distortion."""
 LIGHT = "Splannequin Working Light"
 """Name of the group that restores the highlights of working frames."""
-_IS_OURS = "splannequin_lens"
+_LENS_TAG = "splannequin_lens"
 _MAP = "ST Map"
 """Name of the node that shows the ST map, in the group `LENS`."""
 
@@ -57,7 +57,7 @@ class Plate:
     """Video or image sequence."""
     map: bpy.types.Image | None
     """ST map that undistorts the image, or None."""
-    said: list[str]
+    remarks: list[str]
     """Sentences that describe the plate."""
     size: tuple[int, int]
     """Width and height of the plate in pixels."""
@@ -116,7 +116,7 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
     return Plate(image, st, remarks, footage.size, footage.shift)
 
 
-def read_ahead(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
+def prefetch(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
     """Loads the images that `plate_of` will need, one per iteration."""
     footage, _ = footage_of(take, shot)
     if footage is None or not compat.knows_colour(footage.probe):
@@ -171,7 +171,7 @@ def between(plate: Plate) -> str:
 def kind(node: bpy.types.Node) -> str:
     """LENS or LIGHT for a group node that `through` made, else empty."""
     group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
-    if group is None or not group.get(_IS_OURS):
+    if group is None or not group.get(_LENS_TAG):
         return ""
     return LENS if _MAP in group.nodes else LIGHT
 
@@ -188,7 +188,7 @@ def through(
     if not wanted:
         return picture
     group = bpy.data.node_groups.new(wanted, "CompositorNodeTree")
-    group[_IS_OURS] = True
+    group[_LENS_TAG] = True
     compat.new_socket(group, "Image", "INPUT", "NodeSocketColor")
     compat.new_socket(group, "Image", "OUTPUT", "NodeSocketColor")
     _fill(group, plate)
@@ -227,7 +227,7 @@ def _fill(group: bpy.types.NodeTree, plate: Plate) -> None:
 def images_of(node: bpy.types.Node) -> list[bpy.types.Image]:
     """The images that a node of ours shows, directly or inside its group."""
     group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
-    nodes = group.nodes if group is not None and group.get(_IS_OURS) else [node]
+    nodes = group.nodes if group is not None and group.get(_LENS_TAG) else [node]
     return [n.image for n in nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
 
 
@@ -236,6 +236,6 @@ def drop(node: bpy.types.Node) -> list[bpy.types.Image]:
     images = images_of(node)
     group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
     present(node.id_data).nodes.remove(node)  # pyright: ignore
-    if group is not None and group.get(_IS_OURS) and group.users == 0:
+    if group is not None and group.get(_LENS_TAG) and group.users == 0:
         bpy.data.node_groups.remove(group)
     return images

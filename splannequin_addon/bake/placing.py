@@ -16,17 +16,17 @@ from ..access import present, size_of
 from ..scene import same_footage, scene_setup
 from ..scene.ownership import TAG
 
-_STANDS_IN = "splannequin_stands_in"
+_BEHIND_PLATE = "splannequin_stands_in"
 _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 
 
-def lead_through(
+def route_through(
     tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup, behind: bpy.types.NodeSocket | None
 ) -> None:
     """Routes links through our node: all links from the socket `behind`, or, with None, the link to the output."""
     if behind is not None:
-        source, targets, beside = behind, [present(link.to_socket) for link in links_of(behind)], present(behind.node)
-        node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 320.0)
+        source, targets, anchor = behind, [present(link.to_socket) for link in links_of(behind)], present(behind.node)
+        node.location = (anchor.location.x + anchor.width + 30.0, anchor.location.y - 320.0)
     else:
         end = present(compat.output_socket(tree) or compat.new_output_node(tree))
         source, targets, last = links_of(end)[0].from_socket if end.is_linked else None, [end], present(end.node)
@@ -35,11 +35,11 @@ def lead_through(
         tree.links.new(node.outputs["Image"], target)
     if source is not None:
         tree.links.new(source, node.inputs["Image"])
-    present(node.node_tree)[_STANDS_IN] = behind is not None
+    present(node.node_tree)[_BEHIND_PLATE] = behind is not None
 
 
-def lead_past(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> None:
-    """Undoes `lead_through`: reconnects the group's input directly to the targets of its output."""
+def bypass(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> None:
+    """Undoes `route_through`: reconnects the group's input directly to the targets of its output."""
     sources = [present(link.from_socket) for link in links_of(node.inputs["Image"])]
     for target in [present(link.to_socket) for link in links_of(node.outputs["Image"])]:
         if sources:
@@ -48,9 +48,9 @@ def lead_past(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> 
         tree.links.remove(link)
 
 
-def stands_in(node: bpy.types.CompositorNodeGroup) -> bool:
+def is_behind_plate(node: bpy.types.CompositorNodeGroup) -> bool:
     """True if our node lies behind the plate, False if it lies before the output."""
-    return bool(present(node.node_tree).get(_STANDS_IN))
+    return bool(present(node.node_tree).get(_BEHIND_PLATE))
 
 
 def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy.types.NodeSocket | None:
@@ -64,9 +64,9 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
     if where == "OUTPUT" or tree is None:
         return None
     end = compat.output_socket(tree)
-    led = upstream(end.node if end is not None else None)
-    led = [n for n in led if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
-    nodes = [n for n in tree.nodes if n in led and _picture(n).is_linked]
+    readers = upstream(end.node if end is not None else None)
+    readers = [n for n in readers if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
+    nodes = [n for n in tree.nodes if n in readers and _picture(n).is_linked]
     found = [n for n in nodes if same_footage.shows(_shown(n), footage)]
     if where == "PLATE" and not found:  # shown under another name: take the active node, or the only one
         found = [n for n in nodes if n == tree.nodes.active] or (nodes if len(nodes) == 1 else [])

@@ -54,7 +54,7 @@ def began(shot: Path, run: rendering.Run) -> None:
         finish(shot)
         return False
 
-    job_timer.meanwhile(look)
+    job_timer.call_until_false(look)
 
 
 def finish(shot: Path) -> None:
@@ -72,7 +72,7 @@ def finish(shot: Path) -> None:
         watch.fail("bake", error)
     except (OSError, RuntimeError, ValueError) as error:
         watch.failures["bake"] = f"The render of this shot ended in an error: {error}", "Bake again."
-    notes = [f"{len(run.done)} of {len(run.wanted)} frames rendered.", *run.said]
+    notes = [f"{len(run.done)} of {len(run.wanted)} frames rendered.", *run.notes]
     watch.notes.setdefault("bake", []).extend(note for note in notes if note not in watch.notes.get("bake", []))
 
 

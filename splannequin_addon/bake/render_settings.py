@@ -182,8 +182,8 @@ def _set(owner: Any, row: Setting) -> bool:
 
 
 def _owner(scene: bpy.types.Scene, path: str) -> Any:
-    held: Any = scene
-    return held.path_resolve(path) if path else held
+    untyped: Any = scene
+    return untyped.path_resolve(path) if path else untyped
 
 
 def _has(scene: bpy.types.Scene, row: Setting) -> bool:
@@ -230,28 +230,28 @@ def _animated(scene: bpy.types.Scene) -> set[str]:
 
 # ------------------------------------------------------------------------------------------- saving, loading, undo
 
-going_on: dict[int, bool] = {}
+active_bakes: dict[int, bool] = {}
 """`session_uid` of each scene being baked -> whether its file was saved since the last frame was written."""
 _paused: dict[int, Any] = {}
 """`session_uid` of a scene -> the stored changes of its bake, while the file is being saved."""
 
 
-def left_behind() -> Iterator[bpy.types.Scene]:
+def stale_scenes() -> Iterator[bpy.types.Scene]:
     """Scenes with settings of a bake that is no longer running."""
     for scene in bpy.data.scenes:
-        if _NOTED in scene and scene.session_uid not in going_on and not library_of(scene):
+        if _NOTED in scene and scene.session_uid not in active_bakes and not library_of(scene):
             yield scene
 
 
 @persistent
 def _on_load(*_: object) -> None:
-    going_on.clear()
+    active_bakes.clear()
     _on_undo()
 
 
 @persistent
 def _on_undo(*_: object) -> None:
-    for scene in left_behind():
+    for scene in stale_scenes():
         restore(scene)
 
 
@@ -261,8 +261,8 @@ def _on_save(*_: object) -> None:
     them."""
     _paused.clear()
     for scene in bpy.data.scenes:
-        if scene.session_uid in going_on and _NOTED in scene:
-            going_on[scene.session_uid] = True
+        if scene.session_uid in active_bakes and _NOTED in scene:
+            active_bakes[scene.session_uid] = True
             _paused[scene.session_uid] = scene[_NOTED]
             restore(scene)
 
@@ -272,12 +272,12 @@ def on_saved(*_: object) -> None:
     """Handler: applies the bake's settings again after the file was saved."""
     for scene in bpy.data.scenes:
         noted = _paused.pop(scene.session_uid, None)
-        if noted is None or scene.session_uid not in going_on:
+        if noted is None or scene.session_uid not in active_bakes:
             continue
         for owner, name, _, ours in json.loads(noted):
             setattr(_owner(scene, owner), name, ours)
         scene[_NOTED] = noted
-        going_on[scene.session_uid] = True  # a frame may have started during the save
+        active_bakes[scene.session_uid] = True  # a frame may have started during the save
 
 
 _HANDLERS = (

@@ -26,7 +26,7 @@ from . import render_settings
 
 COMPOSITED = "composited"
 """Name of the images' folder inside the output folder of a bake."""
-_BESIDE = ".part-"
+_PART_PREFIX = ".part-"
 """Name prefix of the temporary folder for one part of a bake."""
 _UNINTERRUPTED = 2.0
 """Seconds between two thread switches of Python while Blender renders.
@@ -90,7 +90,7 @@ class Run:
         self.wanted = list(frames_of(scene))
         self.done: list[int] = []
         """Frames that Blender has rendered and whose images have their final names."""
-        self.said: list[str] = []
+        self.notes: list[str] = []
         """Sentences about the changes made for the render, and about its images."""
         self.error: BaseException | None = None
         """The exception that ended the render."""
@@ -99,10 +99,10 @@ class Run:
         self.on_frame, self._check_cancelled = on_frame, check_cancelled
         self._is_movie = bool(scene.render.is_movie_format)
         self._places: dict[int, Path] = {}
-        self._made: dict[int, Path] = {}
-        self._spoilt: list[int] = []
+        self._files: dict[int, Path] = {}
+        self._unreliable: list[int] = []
         """Frames during which the file was saved, so that they may have used the artist's settings."""
-        self._beside = Path()
+        self._temporary = Path()
         self._room = 8 * scene.render.resolution_x * scene.render.resolution_y
         self._frame = scene.frame_current
 
@@ -119,23 +119,23 @@ class Run:
         has_cg = self._check(scene, self.wanted) if self._check is not None else False
         self._places = _places(scene, self.wanted, self._folder)
         first = self._places[self.wanted[0]].parent
-        self._beside = first / f"{_BESIDE}{uuid.uuid4().hex[:12]}"
-        self.said = render_settings.apply(scene, render_settings.needed(scene, self._is_exact, has_cg))
-        self.said += _told(scene)
+        self._temporary = first / f"{_PART_PREFIX}{uuid.uuid4().hex[:12]}"
+        self.notes = render_settings.apply(scene, render_settings.needed(scene, self._is_exact, has_cg))
+        self.notes += _output_notes(scene)
         try:
             contract.make_folder(first)  # first and separately, so that an OS error names this folder
-            contract.make_folder(self._beside)
-            where = self._beside / (self._places[self.wanted[0]].name if self._is_movie else DIGITS)
-            self._made = _aimed(scene, where, self.wanted)
+            contract.make_folder(self._temporary)
+            where = self._temporary / (self._places[self.wanted[0]].name if self._is_movie else DIGITS)
+            self._files = _set_output_path(scene, where, self.wanted)
         except BaseException as error:
             self._clean(scene)
             if isinstance(error, OSError):
-                raise _in_words(error) from error
+                raise _readable_error(error) from error
             raise
         if sys.getswitchinterval() < _UNINTERRUPTED:
             _usual_interval[0] = sys.getswitchinterval()
             sys.setswitchinterval(_UNINTERRUPTED)
-        render_settings.going_on[self.scene_uid] = False
+        render_settings.active_bakes[self.scene_uid] = False
         bpy.app.handlers.render_write.append(self._written)
 
     def finish(self, scene: bpy.types.Scene | None, is_cancelled: bool = False) -> None:
@@ -150,8 +150,8 @@ class Run:
         """
         with contextlib.suppress(ValueError):
             bpy.app.handlers.render_write.remove(self._written)
-        render_settings.going_on.pop(self.scene_uid, None)
-        if not render_settings.going_on:
+        render_settings.active_bakes.pop(self.scene_uid, None)
+        if not render_settings.active_bakes:
             sys.setswitchinterval(_usual_interval[0])
         try:
             if self._check_cancelled and self.error is None:
@@ -159,9 +159,9 @@ class Run:
                     self._check_cancelled()  # a handler of another add-on may have swallowed the request
                 except BaseException as error:
                     self.error = error
-            if self._spoilt and self.error is None:
+            if self._unreliable and self.error is None:
                 self.error = contract.JobError(
-                    f"The file was saved while frame {self._spoilt[0]} was rendered: that frame is not new.",
+                    f"The file was saved while frame {self._unreliable[0]} was rendered: that frame is not new.",
                     "Bake again.",
                     contract.ExitCode.BAKE,
                 )
@@ -171,7 +171,7 @@ class Run:
             lost = [n for n in self.wanted if n not in set(self.done)]
             if is_whole and lost:
                 message = f"Blender wrote no picture for frame {lost[0]} in {self._folder_name()}."
-                raise self._or_full(message, None)
+                raise self._write_error(message, None)
             if self.error is not None:
                 raise self.error
         finally:
@@ -180,8 +180,8 @@ class Run:
     def refused(self, error: RuntimeError) -> None:
         """Stores Blender's error about a scene that it cannot render, or an image that it cannot write."""
         message = " ".join(str(error).split()).removeprefix("Error: ")
-        message = message.replace(str(self._beside), str(self._folder_name()))
-        self.error = self.error or self._or_full(f"Blender could not render the scene: {message}", None)
+        message = message.replace(str(self._temporary), str(self._folder_name()))
+        self.error = self.error or self._write_error(f"Blender could not render the scene: {message}", None)
 
     def is_of(self, scene: bpy.types.Scene) -> bool:
         """True if this run renders the scene."""
@@ -192,7 +192,7 @@ class Run:
             render_settings.restore(scene)
             if scene.frame_current != self._frame:
                 scene.frame_set(self._frame)
-        shutil.rmtree(self._beside, ignore_errors=True)
+        shutil.rmtree(self._temporary, ignore_errors=True)
 
     def _written(self, scene: bpy.types.Scene, *_: object) -> None:
         """Handler: Blender has written a frame. In a window it runs in another thread, so its only bpy access ends the
@@ -201,54 +201,54 @@ class Run:
             return
         number = scene.frame_current
         try:
-            if self.error is None and number in self._made:
-                if render_settings.going_on.get(self.scene_uid):
-                    render_settings.going_on[self.scene_uid] = False
-                    self._spoilt.append(number)
+            if self.error is None and number in self._files:
+                if render_settings.active_bakes.get(self.scene_uid):
+                    render_settings.active_bakes[self.scene_uid] = False
+                    self._unreliable.append(number)
                     return
                 if not self._is_movie:
-                    self._publish(self._made[number], self._places[number], f"frame {number}")
+                    self._publish(self._files[number], self._places[number], f"frame {number}")
                 self.done.append(number)
                 if self.on_frame:
                     self.on_frame(len(self.done), len(self.wanted))
                 if self._check_cancelled:
                     self._check_cancelled()
         except BaseException as error:  # Blender would print it and continue to render
-            self.error = self.error or (_in_words(error) if isinstance(error, OSError) else error)
+            self.error = self.error or (_readable_error(error) if isinstance(error, OSError) else error)
         if self.error is not None:
             # The render loop continues from this frame number: after the last frame it ends and closes its files.
             scene.frame_current = scene.frame_end
 
-    def _publish(self, made: Path, place: Path, what: str) -> None:
+    def _publish(self, path: Path, place: Path, what: str) -> None:
         """Moves a complete file to its final name. Raises JobError if it is incomplete, or OSError."""
-        if not contract.is_whole_picture(made):
-            raise self._or_full(f"Blender wrote {what} only in part to {place.parent}.", made)
-        with open(made, "rb+") as file:
+        if not contract.is_whole_picture(path):
+            raise self._write_error(f"Blender wrote {what} only in part to {place.parent}.", path)
+        with open(path, "rb+") as file:
             os.fsync(file.fileno())
         contract.make_folder(place.parent)
-        contract.replace_file(made, place)
+        contract.replace_file(path, place)
 
     def _publish_movie(self, is_whole: bool) -> None:
         """Moves a movie to its final name. An incomplete movie does not replace an existing file."""
         folder = self._places[self.wanted[0]].parent
-        for made in sorted(self._beside.iterdir()):
-            place = folder / made.name
+        for path in sorted(self._temporary.iterdir()):
+            place = folder / path.name
             if is_whole or not place.exists():
                 try:
-                    self._publish(made, place, made.name)
+                    self._publish(path, place, path.name)
                 except (contract.JobError, OSError) as error:
-                    self.error = self.error or (_in_words(error) if isinstance(error, OSError) else error)
+                    self.error = self.error or (_readable_error(error) if isinstance(error, OSError) else error)
 
-    def _or_full(self, message: str, made: Path | None) -> contract.JobError:
+    def _write_error(self, message: str, path: Path | None) -> contract.JobError:
         """The error for an image that Blender wrote partly or not at all: a full disk, or `message`.
 
         Args:
             message: message if the disk is not full.
-            made: the incomplete image file, or None.
+            path: the incomplete image file, or None.
         """
         folder = self._folder_name()
         # A truncated file remains on the disk and uses the last free space.
-        if is_full(self._beside, self._room if made is None or not made.exists() else 1 << 18):
+        if is_full(self._temporary, self._room if path is None or not path.exists() else 1 << 18):
             return contract.disk_error(folder)
         return contract.JobError(
             message, f"Can {folder} be written to? Blender's console may say more.", contract.ExitCode.BAKE
@@ -294,7 +294,7 @@ def render(
         )
     run = Run(scene, folder, png or is_part, on_frame, check_cancelled, check)
     run.begin(scene)
-    for line in run.said if say else ():
+    for line in run.notes if say else ():
         say(line)  # pyright: ignore[reportOptionalCall]
     try:
         bpy.ops.render.render(animation=True, scene=scene.name)
@@ -337,7 +337,7 @@ def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
             "Bake the part that it belongs to again.",
             contract.ExitCode.BAKE,
         )
-    for left in folder.glob(f"{_BESIDE}*"):
+    for left in folder.glob(f"{_PART_PREFIX}*"):
         shutil.rmtree(left, ignore_errors=True)
     return wanted
 
@@ -368,7 +368,7 @@ def _named(scene: bpy.types.Scene, frames: list[int]) -> dict[int, Path]:
         ) from error
 
 
-def _aimed(scene: bpy.types.Scene, pattern: Path, frames: list[int]) -> dict[int, Path]:
+def _set_output_path(scene: bpy.types.Scene, pattern: Path, frames: list[int]) -> dict[int, Path]:
     """Sets the scene's output path to a literal path. Returns frame -> file. Raises JobError if Blender cannot use
     it."""
     text = os.path.abspath(pattern)
@@ -376,12 +376,12 @@ def _aimed(scene: bpy.types.Scene, pattern: Path, frames: list[int]) -> dict[int
         text = "/" + text.lstrip("/")  # two slashes would mean relative to the .blend
     try:
         render_settings.set_noted(scene, "render", "filepath", compat.literal(text))
-        made = _named(scene, frames)
+        files = _named(scene, frames)
     except (ValueError, contract.JobError) as error:  # ValueError: the name is not valid UTF-8
         raise _unusable(pattern.parent.parent) from error
-    if any(path.parent != Path(text).parent for path in made.values()):  # truncated, or a variable expanded
+    if any(path.parent != Path(text).parent for path in files.values()):  # truncated, or a variable expanded
         raise _unusable(pattern.parent.parent)
-    return made
+    return files
 
 
 def _unusable(folder: Path) -> contract.JobError:
@@ -393,11 +393,11 @@ def _unusable(folder: Path) -> contract.JobError:
     )
 
 
-def _in_words(error: OSError) -> BaseException:
+def _readable_error(error: OSError) -> BaseException:
     return contract.path_error(error) or error
 
 
-def _told(scene: bpy.types.Scene) -> list[str]:
+def _output_notes(scene: bpy.types.Scene) -> list[str]:
     """Sentences about output settings of the artist that are easy to overlook."""
     render, found = scene.render, list[str]()
     if render.resolution_percentage != 100:

@@ -105,13 +105,13 @@ class Bake(Step):
             return "The compositor shows this take: bake another one, or remove the shot from the scene, first"
         return ""
 
-    def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
+    def is_present(self, scene: bpy.types.Scene, shot: Path) -> bool:
         """True if the compositor shows a take of the shot."""
         return _baked(scene) == shot
 
-    def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
+    def remove(self, scene: bpy.types.Scene, shot: Path, remaining: list[Path]) -> list[str]:
         """Removes the freeze from the compositor, unless it belongs to another shot."""
-        gone = _baked(scene) not in others and insertion.remove(scene)
+        gone = _baked(scene) not in remaining and insertion.remove(scene)
         return ["The freeze left the compositor."] if gone else []
 
     def scaled(self, scene: bpy.types.Scene, shot: Path) -> list[str]:

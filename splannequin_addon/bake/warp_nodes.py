@@ -85,8 +85,8 @@ def _between(
 def _mixed(
     tree: bpy.types.NodeTree,
     amount: bpy.types.NodeSocket | float,
-    one: bpy.types.NodeSocket,
-    other: bpy.types.NodeSocket,
+    base: bpy.types.NodeSocket,
+    overlay: bpy.types.NodeSocket,
     blend: str = "MIX",
 ) -> bpy.types.NodeSocket:
     """Socket of the blend of two images, or of an image and a value."""
@@ -95,6 +95,6 @@ def _mixed(
         factor.default_value = amount
     else:
         tree.links.new(amount, factor)
-    tree.links.new(one, first)
-    tree.links.new(other, second)
+    tree.links.new(base, first)
+    tree.links.new(overlay, second)
     return result

@@ -36,14 +36,14 @@ def lit(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket) -> bpy.types.No
     names = {node.name for node in tree.nodes}
     # The curve is defined for linear Rec.709. In another working space the channels are converted there and back.
     channels = _through(tree, list(compat.separated(tree, picture)), Color.from_scene_linear_to_rec709_linear)
-    channels = _through(tree, [_bent_back(tree, c) for c in channels], Color.from_rec709_linear_to_scene_linear)
+    channels = _through(tree, [_inverse_shoulder(tree, c) for c in channels], Color.from_rec709_linear_to_scene_linear)
     whole = compat.combined(tree, channels)
     for column, node in enumerate(n for n in tree.nodes if n.name not in names):
         node.location = (_WIDE * (column % 8), -300.0 - _WIDE * (column // 8))
     return whole
 
 
-def _bent_back(tree: bpy.types.NodeTree, channel: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+def _inverse_shoulder(tree: bpy.types.NodeTree, channel: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """Decoded light of a channel that was read as sRGB: max(c, knee) through the curve, less the knee, plus min(c,
     knee)."""
     start, roll = contract.SHOULDER_FROM, contract.SHOULDER_ROLL

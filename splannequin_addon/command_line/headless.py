@@ -65,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
             contract.end_with_starter()
         for note in contract.notes(args):
             print(f"note: {note}", file=sys.stderr, flush=True)
-        return int(_DOES[args.command](args, Console(contract.as_json(args))))
+        return int(_COMMANDS[args.command](args, Console(contract.as_json(args))))
     except SystemExit as stop:
         return int(stop.code or 0)
     except (contract.Cancelled, KeyboardInterrupt):
@@ -113,7 +113,7 @@ def export_for_farm(args: argparse.Namespace, console: Console) -> int:
     _output(args)
     words: contract.FarmWords = contract.words_of(args)
     args.t_star = None  # each instant becomes a separate take
-    requests: dict[str, Any] = {kind: dataclasses.asdict(params) for kind, params in asked(args).items()}
+    requests: dict[str, Any] = {kind: dataclasses.asdict(params) for kind, params in requested_params(args).items()}
     if not contract.trains_anew(args):
         del requests["train"]
     if args.request:
@@ -156,7 +156,7 @@ def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
     contract.check_same_clip(shot, args.clip)
     scene, fresh = _scene(args.blend)
     settings_of(scene).shot_path = str(shot)
-    requests = asked(args)
+    requests = requested_params(args)
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
     for step in ("import", "solve", "train", "freeze"):
@@ -245,7 +245,7 @@ def _bake_a_part(
     if fresh:
         first_view.set_up(scene, shot, args.take)
     _save(scene, output / "shot.blend", folder)
-    summary = {"version": 1, "shot": str(shot), "take": args.take, **_told(output, numbers)}
+    summary = {"version": 1, "shot": str(shot), "take": args.take, **_bake_facts(output, numbers)}
     contract.write_json(output / contract.SUMMARY_FILE, summary, parents=False)
     console.say(f"Composited frames: {folder}")
     return ExitCode.OK
@@ -290,7 +290,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
 
 
 def _one_step(args: argparse.Namespace, console: Console, step: str, shot: str) -> int:
-    (params,) = asked(args).values()
+    (params,) = requested_params(args).values()
     scene = scene_in(bpy.context)
     settings_of(scene).shot_path = str(Path(shot).absolute())
     if step == "solve":
@@ -358,7 +358,7 @@ def _bake(
     if fresh:
         first_view.set_up(scene, shot, take)
     _save(scene, output / "shot.blend", folder)
-    return _told(output, numbers)
+    return _bake_facts(output, numbers)
 
 
 def _render(scene: bpy.types.Scene, folder: Path, fresh: bool, console: Console, is_part: bool = False) -> list[int]:
@@ -399,7 +399,7 @@ def _summary_of(path: Path, shot: Path, take: str) -> dict[str, Any]:
     return found if is_same and isinstance(found.get("wall_seconds_by_stage", {}), dict) else fresh
 
 
-def _told(output: Path, numbers: list[int]) -> dict[str, Any]:
+def _bake_facts(output: Path, numbers: list[int]) -> dict[str, Any]:
     """The summary's facts about a bake."""
     return {
         "composited_dir": str(output / rendering.COMPOSITED),
@@ -436,7 +436,7 @@ def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
             contract.replace_file(blend, blend.with_name(f"{blend.name}1"))
 
 
-def asked(args: argparse.Namespace) -> dict[str, Any]:
+def requested_params(args: argparse.Namespace) -> dict[str, Any]:
     """Kind of job -> parameters from a parsed command line; empty for a command that starts no job."""
     return contract.requested_params(args, {"device": backend.device()})
 
@@ -464,7 +464,7 @@ def _output(args: argparse.Namespace) -> Path:
     return output
 
 
-_DOES = {
+_COMMANDS = {
     "import": import_clip,
     "solve": solve,
     "train": train,

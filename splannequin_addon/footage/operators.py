@@ -65,7 +65,7 @@ def _is_of(one: OneShot, clip: str) -> bool:
     """True if a shot has this clip (an absolute path), or has no clip and lies at the clip's default shot folder."""
     if one.clip:
         return os.path.normcase(paths.absolute(one.clip)) == os.path.normcase(clip)
-    return selection.folder_of(one) == selection.beside(Path(clip))
+    return selection.folder_of(one) == selection.folder_of_clip(Path(clip))
 
 
 class SPLANNEQUIN_OT_use_movie_clip(bpy.types.Operator):
@@ -154,8 +154,8 @@ def replaces(scene: bpy.types.Scene) -> str:
         return ""
     work = ", ".join(contract.work_words(contract.ShotFolder(folder)))
     if clip and source.is_of(folder, clip) is False:
-        other = contract.printable(source.named(folder))
-        question = f"{folder.name} is the shot of {other}: its frames are replaced."
+        source_name = contract.printable(source.named(folder))
+        question = f"{folder.name} is the shot of {source_name}: its frames are replaced."
         return f"{question} What was made from them moves to its folder replaced: {work}." if work else question
     if not work:
         return ""

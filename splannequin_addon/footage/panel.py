@@ -52,7 +52,7 @@ class ImportPanel(step_panel.StepPanel):
         trouble, setup = job_timer.backend_trouble(), preferences.running_setup()
         if setup is not None:
             wrap(layout, context, "The backend is being set up.", "IMPORT")
-            for line in setup.said[-1:]:
+            for line in setup.output[-1:]:
                 wrap(layout, context, line)
             layout.operator("splannequin.cancel_setup", icon=icons.of("splannequin.cancel_setup"))
         elif trouble is not None:

@@ -69,7 +69,7 @@ class Import(Step):
     def ended(self, job: jobs.Job) -> None:
         """Deletes the empty shot folder of an import that failed or was cancelled."""
         if job.state != "done" and _discard(job):
-            job_timer.meanwhile(functools.partial(_discard, job))
+            job_timer.call_until_false(functools.partial(_discard, job))
 
     def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
         """Looks through the camera that shows the clip."""

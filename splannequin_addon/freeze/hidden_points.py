@@ -62,17 +62,17 @@ def _restore(*_: object) -> None:
             entry.points_hidden_in = ""
 
 
-def _names(told: str) -> list[str]:
+def _names(stored: str) -> list[str]:
     """View layers that `_hide` stored; empty if the file was edited by hand."""
     try:
-        names: object = json.loads(told)
+        names: object = json.loads(stored)
     except ValueError:
         return []
     return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []  # pyright: ignore[reportUnknownVariableType]
 
 
 @persistent
-def _agree(*_: object) -> None:
+def _update(*_: object) -> None:
     """Handler after a save, an undo or a file load: the points are hidden if and only if their shot is being
     scrubbed."""
     _restore()
@@ -85,7 +85,7 @@ def _handlers() -> list[tuple[Any, Any]]:
     """Pairs of (Blender's handler list, function) that are registered."""
     lists = bpy.app.handlers
     after = [lists.save_post, lists.save_post_fail, lists.undo_post, lists.redo_post, lists.load_post]
-    return [(lists.save_pre, _restore), *((one, _agree) for one in after)]
+    return [(lists.save_pre, _restore), *((one, _update) for one in after)]
 
 
 def register() -> None:

@@ -59,7 +59,7 @@ def remove(scene: bpy.types.Scene, shot: Path) -> bool:
     entry.light = None
     if scene.world == world:
         scene.world = None
-        _give_world_back(scene)
+        _restore_world(scene)
     if not any(one.light for one in settings_of(scene).made):
         settings_of(scene).world_before = None
     image = _image_in(world)
@@ -76,7 +76,7 @@ def _keep_world(scene: bpy.types.Scene) -> None:
         settings_of(scene).world_before = scene.world
 
 
-def _give_world_back(scene: bpy.types.Scene) -> None:
+def _restore_world(scene: bpy.types.Scene) -> None:
     """Sets the world of a scene whose light was removed: another shot's light, or the world from before all lights."""
     lights = [entry.light for entry in settings_of(scene).made if entry.light is not None]
     scene.world = lights[0] if lights else settings_of(scene).world_before
@@ -122,10 +122,10 @@ def _world(
     tree = present(world.node_tree)
     tree.nodes.clear()
     kinds = ("TexCoord", "Mapping", "Mapping", "TexEnvironment", "Background", "OutputWorld")
-    made: list[Any] = [tree.nodes.new(f"ShaderNode{kind}") for kind in kinds]
-    for column, node in enumerate(made):
-        node.location = (260.0 * (column - len(made)), 300.0)
-    source, to_solve, to_picture, picture, background, output = made
+    nodes: list[Any] = [tree.nodes.new(f"ShaderNode{kind}") for kind in kinds]
+    for column, node in enumerate(nodes):
+        node.location = (260.0 * (column - len(nodes)), 300.0)
+    source, to_solve, to_picture, picture, background, output = nodes
     to_solve.label, to_picture.label = "From the Shot's Root", "To the Panorama"
     to_solve.vector_type, to_picture.vector_type = "TEXTURE", "VECTOR"
     _follow(to_solve.inputs["Rotation"], root)

@@ -28,7 +28,7 @@ _PATIENCE_SECONDS = 10.0
 class Frame:
     """A rendered view of the frozen instant."""
 
-    asked: contract.LiveView
+    request: contract.LiveView
     """The request."""
     t_star: int
     """Frame number at which time stands still: the requested one, or the nearest trained one."""
@@ -55,7 +55,7 @@ class Session:
     drawn: int = 0
     """Number of frames received."""
     _process: subprocess.Popen[bytes] | None = None
-    _asked: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
+    _requests: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
     _to_send: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
     _sent: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
     _change: threading.Condition = field(default_factory=threading.Condition)
@@ -79,12 +79,12 @@ class Session:
         with self._change:
             self._seq += 1
             view.seq = self._seq
-            self._asked[view.view] = self._to_send[view.view] = self._sent[view.seq] = view
+            self._requests[view.view] = self._to_send[view.view] = self._sent[view.seq] = view
             self._change.notify()
 
     def wanted(self, view: int) -> contract.LiveView | None:
         """The last request for a view, or None."""
-        return self._asked.get(view)
+        return self._requests.get(view)
 
     def busy(self, view: int) -> bool:
         """True while the last request for a view has no answer."""

@@ -139,5 +139,7 @@ def arrived(shot: Path, result: dict[str, Any]) -> list[str]:
         file = paths.absolute(image.filepath) if image.filepath and not image.library else ""
         if file and os.path.abspath(file).startswith(inside + os.sep):
             image.reload()
-    made = list(inventory.mattes(folder))
-    return [f"{len(made)} mattes in take {result['take']}: {', '.join(made)}."] if made else ["The take has no mattes."]
+    names = list(inventory.mattes(folder))
+    return (
+        [f"{len(names)} mattes in take {result['take']}: {', '.join(names)}."] if names else ["The take has no mattes."]
+    )

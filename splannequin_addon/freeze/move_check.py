@@ -111,10 +111,10 @@ def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_tim
             drawn.close()
 
 
-def share_of(frame: live.Frame | None, asked: contract.LiveView) -> float:
+def share_of(frame: live.Frame | None, request: contract.LiveView) -> float:
     """Fraction of a drawn view's pixels that are guesses, 0..1. Raises JobError if the frame answers another
     request."""
-    if frame is None or frame.asked.seq != asked.seq:
+    if frame is None or frame.request.seq != request.seq:
         raise contract.JobError("The backend could not draw what the camera sees.", "Try again.")
     return float(np.count_nonzero(frame.rgba[..., 0] < _SUPPORTED) / max(1, frame.rgba[..., 0].size))
 

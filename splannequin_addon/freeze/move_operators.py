@@ -183,13 +183,13 @@ class _Stops(_Move):
     def stopped(
         self, scene: bpy.types.Scene, path: ClipPath, ease_in: float, hold: float, ease_out: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Poses [N, 4, 4] and lenses [N, 3] of the path with a stop at `frame`, and `Timing.held`."""
+        """Poses [N, 4, 4] and lenses [N, 3] of the path with a stop at `frame`, and `Timing.stop_fraction`."""
         if not self.properties.is_property_set("frame"):
             self.frame = scene.frame_current
         self.frame = min(max(self.frame, path.first), path.last)
         timing = moves.retimed(path.first, path.last, self.frame, ease_in, hold, ease_out)
         poses = moves.at(moves.smoothed(path.poses, self.smooth, self.smooth), timing.frames - path.first)
-        return poses, path.lenses_at(timing.frames), timing.held
+        return poses, path.lenses_at(timing.frames), timing.stop_fraction
 
 
 class SPLANNEQUIN_OT_move_retime(_Stops, bpy.types.Operator):
@@ -221,7 +221,7 @@ _SECONDS: dict[str, Any] = {
     "min": 0.0,
     "soft_max": 20.0,
 }
-_BOTH: dict[str, Any] = {
+_EASE_BOTH: dict[str, Any] = {
     "name": "Ease",
     "description": "Frames in which the camera slows down, and in which it speeds up again",
     **_EASE,
@@ -243,7 +243,7 @@ class SPLANNEQUIN_OT_move_hold(_Stops, bpy.types.Operator):
 
     frame = IntProperty(**_FRAME)
     seconds = FloatProperty(**_SECONDS)
-    ease = IntProperty(**_BOTH)
+    ease = IntProperty(**_EASE_BOTH)
     smooth = FloatProperty(**_SMOOTH)
     fit_range = BoolProperty(**_FIT)
 
@@ -288,13 +288,13 @@ class SPLANNEQUIN_OT_move_orbit(_Stops, bpy.types.Operator):
         subtype="DISTANCE",
         options={"SKIP_SAVE"},
     )
-    ease = IntProperty(**_BOTH)
+    ease = IntProperty(**_EASE_BOTH)
     smooth = FloatProperty(**_SMOOTH)
     fit_range = BoolProperty(**_FIT)
 
     def moved(self, scene: bpy.types.Scene, path: ClipPath) -> tuple[np.ndarray, np.ndarray]:
         """Poses and lenses of the path with the orbit during the stop."""
-        poses, lenses, held = self.stopped(scene, path, self.ease, _frames(scene, self.seconds), self.ease)
+        poses, lenses, stop_fraction = self.stopped(scene, path, self.ease, _frames(scene, self.seconds), self.ease)
         pose = moves.at(moves.smoothed(path.poses, self.smooth, self.smooth), np.array([self.frame - path.first]))[0]
         root = present(scene_objects.part(scene, path.shot, "root"))
         scale = scene_objects.depth_scale(scene, path.shot)
@@ -302,7 +302,7 @@ class SPLANNEQUIN_OT_move_orbit(_Stops, bpy.types.Operator):
         up = np.array((root.matrix_world.inverted().to_3x3() @ Vector((0.0, 0.0, 1.0))).normalized(), dtype=np.float64)
         pivot = moves.in_the_middle(pose, _lens(path, self.frame), (path.solved.width, path.solved.height), depth)
         # A positive rotation about the camera's right axis moves the camera down, because the camera looks along -z.
-        return moves.orbit(poses, held, pivot, up, (self.angle, -self.rise)), lenses
+        return moves.orbit(poses, stop_fraction, pivot, up, (self.angle, -self.rise)), lenses
 
 
 def found_depth(scene: bpy.types.Scene, path: ClipPath, frame: int, pose: np.ndarray) -> float:

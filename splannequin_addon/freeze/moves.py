@@ -22,7 +22,7 @@ class Timing:
 
     frames: Array
     """[N] fractional frame number of the clip."""
-    held: Array
+    stop_fraction: Array
     """[N] elapsed fraction of the stop, 0..1: 0 before it, 1 after it."""
 
 
@@ -73,8 +73,8 @@ def retimed(first: int, last: int, stop: float, ease_in: float, hold: float, eas
     frames += ease_in * (into - into**3 + into**4 / 2.0)  # the integral of 1 - smoothstep
     frames += ease_out * (out**3 - out**4 / 2.0)
     frames += np.maximum(time - faster - ease_out, 0.0)
-    held = np.clip((time - still) / hold, 0.0, 1.0) if hold > 0 else (time >= still).astype(np.float64)
-    return Timing(np.minimum(frames, last), held)
+    stop_fraction = np.clip((time - still) / hold, 0.0, 1.0) if hold > 0 else (time >= still).astype(np.float64)
+    return Timing(np.minimum(frames, last), stop_fraction)
 
 
 def filled(numbers: Array, poses: Array) -> Array:
@@ -118,12 +118,12 @@ def at(poses: Array, places: Array) -> Array:
     return _poses(ends + slopes[index] * (cube - 2 * square + share) + slopes[index + 1] * (cube - square))
 
 
-def orbit(poses: Array, held: Array, pivot: Array, up: Array, angles: tuple[float, float]) -> Array:
+def orbit(poses: Array, stop_fraction: Array, pivot: Array, up: Array, angles: tuple[float, float]) -> Array:
     """A path with an orbit around a point, there and back, during its stop.
 
     Args:
         poses: [N, 4, 4].
-        held: [N], see `Timing`. The swing is largest at 0.5. At 0 and 1 the swing and its speed are 0.
+        stop_fraction: [N], see `Timing`. The swing is largest at 0.5. At 0 and 1 the swing and its speed are 0.
         pivot: centre of the orbit, [3].
         up: axis of the orbit, unit vector [3].
         angles: largest rotations in radians: around `up`, and around the camera's right axis.
@@ -131,7 +131,7 @@ def orbit(poses: Array, held: Array, pivot: Array, up: Array, angles: tuple[floa
     Returns:
         [N, 4, 4] float64.
     """
-    swing = (1.0 - np.cos(2.0 * np.pi * held)) / 2.0
+    swing = (1.0 - np.cos(2.0 * np.pi * stop_fraction)) / 2.0
     result = np.array(poses, dtype=np.float64)
     for axes, angle in ((result[:, :3, 0].copy(), angles[1]), (np.broadcast_to(up, (len(poses), 3)), angles[0])):
         turn = rotations(_quaternion_of(axes, swing * angle))

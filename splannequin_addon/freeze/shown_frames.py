@@ -27,9 +27,9 @@ def show(scene: bpy.types.Scene, shot: Path, name: str, first: int, last: int) -
     image = sequences.load_sequence(path, f"Frozen {name}", "srgb")
     shown = next((b for b in data.background_images if b.image == image), None)
     background = shown or data.background_images.new()
-    for other in data.background_images:
-        if other.image is not None and other.image.get(TAG) and other.display_depth == "BACK":
-            other.show_background_image = other == background
+    for entry in data.background_images:
+        if entry.image is not None and entry.image.get(TAG) and entry.display_depth == "BACK":
+            entry.show_background_image = entry == background
     background.image = image
     sequences.show_sequence(background.image_user, image, first, last)
     background.frame_method, background.display_depth, background.alpha = "FIT", "BACK", 1.0

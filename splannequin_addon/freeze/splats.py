@@ -174,13 +174,13 @@ def _keep(scene: bpy.types.Scene, shot: Path, take: str, items: list[bpy.types.O
     """Parents objects, given in the take's placement, to the shot's root. Stores the first one as the take's splats."""
     remove(scene, shot, take)
     root, entry = present(scene_objects.part(scene, shot, "root")), scene_objects.new(scene, shot)
-    stands = placement.in_solve(contract.placement_of(facts))
+    transform = placement.in_solve(contract.placement_of(facts))
     for item in items:
         for collection in item.users_collection:
             collection.objects.unlink(item)
         present(entry.collection).objects.link(item)
         item.parent, item.matrix_parent_inverse = root, Matrix()
-        item.matrix_basis = stands @ item.matrix_basis
+        item.matrix_basis = transform @ item.matrix_basis
     kept = entry.splats.add()
     kept.name, kept.object = take, items[0]
 
@@ -205,9 +205,9 @@ def import_natively(
     fresh = [item for item in bpy.data.objects if item.session_uid not in known]
     bpy.context.view_layer.update()
     filled = [(item, item.matrix_world.copy()) for item in fresh if item.data is not None]
-    for item, stands in filled:  # the stage's hierarchy is not needed under the root
+    for item, matrix in filled:  # the stage's hierarchy is not needed under the root
         item.parent = None
-        item.matrix_basis = stands
+        item.matrix_basis = matrix
         item.hide_render = True
     bpy.data.batch_remove([item for item in fresh if item.data is None])
     if not filled:

@@ -84,11 +84,11 @@ class Freeze(Step):
         if job.kind == "mattes":
             return mattes.arrived(job.shot, job.result)
         if job.kind == "surface":
-            is_here = scene_objects.part(scene, job.shot, "root") is not None
-            return surfaces.add(scene, job.shot, str(job.result["take"])) if is_here else []
+            has_root = scene_objects.part(scene, job.shot, "root") is not None
+            return surfaces.add(scene, job.shot, str(job.result["take"])) if has_root else []
         if job.kind == "light":
-            is_here = scene_objects.part(scene, job.shot, "root") is not None
-            if not is_here or job.scene_uid not in (0, scene.session_uid):
+            has_root = scene_objects.part(scene, job.shot, "root") is not None
+            if not has_root or job.scene_uid not in (0, scene.session_uid):
                 return []
             return lights.add(scene, job.shot, str(job.result["take"]), str(job.result["key"]))
         if job.kind == "combine":
@@ -110,7 +110,7 @@ class Freeze(Step):
         job_timer.work(job.shot, self.name, surfaces.added_in_turns(scene.session_uid, job.shot, take))
         return True
 
-    def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
+    def remove(self, scene: bpy.types.Scene, shot: Path, remaining: list[Path]) -> list[str]:
         """Removes splats, surfaces and the light from the file."""
         done = ["Splats were removed."] if splats.remove(scene, shot) else []
         done += ["Surfaces were removed."] if surfaces.remove(scene, shot) else []
@@ -132,11 +132,11 @@ def _lines(state: ShotState, take: dict[str, Any]) -> list[str]:
         instant = "Time stands still as t* was keyed"
     across, down = take.get("margin", (0, 0))
     beyond = [f"Overscan: {across} pixels on each side, {down} above and below"] if across or down else []
-    verdict = _own_verdict(state, take)
+    verdict = _new_verdict_lines(state, take)
     return [instant, *verdict[:1], frames, *beyond, *verdict[1:]]
 
 
-def _own_verdict(state: ShotState, take: dict[str, Any]) -> list[str]:
+def _new_verdict_lines(state: ShotState, take: dict[str, Any]) -> list[str]:
     """Lines of a take's verdict that Train does not show already, because a take repeats the problems of its run."""
     run = contract.verdict_of(state.runs.get(take["run"], {}))
     sentences = [*run.sentences, *run.advice] if run is not None else []

@@ -26,7 +26,7 @@ class SPLANNEQUIN_OT_add_surface(takes.NeedsTake, step_operator.StepOperator, bp
         scene = scene_in(context)
         folder, take = begin.needed(scene, self.step), settings_of(scene).take_name
         scene_objects.check_root(scene, folder)
-        if not surfaces.is_made(folder, take):
+        if not surfaces.has_surface(folder, take):
             return super().perform(context)
         if bpy.app.background:
             return step_operator.edit(self, context, self.step, lambda scene, shot: surfaces.add(scene, shot, take))

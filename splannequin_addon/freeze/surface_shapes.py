@@ -30,9 +30,9 @@ class Shape:
 def begin(path: Path) -> Future[list[Shape]]:
     """Starts to read a surface in a thread. The result is [room, people]."""
     pool = ThreadPoolExecutor(1)
-    made = pool.submit(shapes, path)
+    future = pool.submit(shapes, path)
     pool.shutdown(wait=False)
-    return made
+    return future
 
 
 def shapes(path: Path) -> list[Shape]:

@@ -71,7 +71,7 @@ def added_in_turns(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.
     job_timer.redraw()
 
 
-def is_made(shot: Path, take: str) -> bool:
+def has_surface(shot: Path, take: str) -> bool:
     """True if the current version of the take has a surface."""
     return contract.surface_of_take(contract.TakeFolder(contract.ShotFolder(shot).take(take))) is not None
 
@@ -83,7 +83,7 @@ def _done(take: str) -> str:
 def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
     """take.json of a take whose surface can be added. Raises JobError, which names what is missing."""
     facts = inventory.read(shot).takes.get(take)
-    if facts is None or not is_made(shot, take):
+    if facts is None or not has_surface(shot, take):
         raise contract.JobError(f"Take {take} has no surface.", "Make it first.", contract.ExitCode.USAGE)
     scene_objects.check_root(scene, shot)
     return facts
@@ -95,10 +95,10 @@ def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
 def _reading(path: Path) -> Generator[job_timer.Progress, None, list[Shape]]:
     """The shapes of `PARTS`, read in a thread, because it takes a second. Raises ValueError if the surface is
     damaged."""
-    made = surface_shapes.begin(path)
-    while not made.done() and not bpy.app.background:
+    future = surface_shapes.begin(path)
+    while not future.done() and not bpy.app.background:
         yield job_timer.Progress("Reading the surface", 0, 1)
-    return made.result()
+    return future.result()
 
 
 def _fill_elements(mesh: bpy.types.Mesh, shape: Shape) -> None:
@@ -133,8 +133,8 @@ def _fill_colors(mesh: bpy.types.Mesh, shape: Shape) -> None:
 
 
 def _set(mesh: bpy.types.Mesh, attribute: str, field: str, values: np.ndarray) -> None:
-    made: Any = mesh.attributes[attribute]
-    made.data.foreach_set(field, values.ravel())
+    target: Any = mesh.attributes[attribute]
+    target.data.foreach_set(field, values.ravel())
 
 
 # ------------------------------------------------------------------------------------------------- the scene
@@ -144,7 +144,7 @@ def _show(scene: bpy.types.Scene, shot: Path, take: str, meshes: list[bpy.types.
     """Parents finished meshes to the shot's root as shadow catchers and replaces the previous ones."""
     remove(scene, shot, take)
     root, entry = present(scene_objects.part(scene, shot, "root")), scene_objects.new(scene, shot)
-    stands = placement.in_solve(contract.placement_of(facts))
+    transform = placement.in_solve(contract.placement_of(facts))
     for part, mesh in zip(PARTS, meshes, strict=True):
         if not len(mesh.polygons):
             bpy.data.meshes.remove(mesh)
@@ -152,7 +152,7 @@ def _show(scene: bpy.types.Scene, shot: Path, take: str, meshes: list[bpy.types.
         mesh.materials.append(_material())
         item = bpy.data.objects.new(mesh.name, mesh)
         present(entry.collection).objects.link(item)
-        item.parent, item.matrix_parent_inverse, item.matrix_basis = root, Matrix(), stands
+        item.parent, item.matrix_parent_inverse, item.matrix_basis = root, Matrix(), transform
         # A holdout would also hide objects behind people. But it would cast people's shadows, which the plate already
         # has, and it would not catch any shadows.
         item.is_shadow_catcher = True

@@ -42,8 +42,8 @@ class NeedsTake(OperatorBase):
         if not has_chosen(context):
             cls.poll_message_set(tr("Freeze first"))
             return False
-        other = getattr(super(), "poll", None)
-        return other is None or bool(other(context))
+        inherited = getattr(super(), "poll", None)
+        return inherited is None or bool(inherited(context))
 
 
 def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
@@ -89,12 +89,12 @@ def freeze_from(scene: bpy.types.Scene, path: contract.CameraPath, step: str = "
     if step == "bake" and file.is_file():
         path = _with_rest(path, contract.CameraPath.load(file))
     contract.write_json(file, path.to_json(), parents=False)
-    params = _asked(scene, step)
+    params = _step_params(scene, step)
     params.camera_path, params.width = str(file), path.width
     return params
 
 
-def _asked(scene: bpy.types.Scene, step: str) -> contract.FreezeParams:
+def _step_params(scene: bpy.types.Scene, step: str) -> contract.FreezeParams:
     """The parameters of the Freeze or Bake step from the scene's settings."""
     params = steps.STEPS[step].params(scene)
     assert isinstance(params, contract.FreezeParams)
@@ -157,8 +157,8 @@ def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
         return "Its overscan is not the one chosen now."
     if abs(take["shutter"] - params.shutter) > 1e-3:
         return "Its motion blur is not the one chosen now."
-    lacking = 0 if camera else take["frames_in_all"] - take["frame_count"]
-    return f"{lacking} of its {take['frames_in_all']} frames are not rendered yet." if lacking > 0 else ""
+    missing = 0 if camera else take["frames_in_all"] - take["frame_count"]
+    return f"{missing} of its {take['frames_in_all']} frames are not rendered yet." if missing > 0 else ""
 
 
 def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool:
@@ -213,7 +213,7 @@ def read_camera(scene: bpy.types.Scene, step: str) -> contract.FreezeParams | No
     name, folder = own_camera.name_of(scene), selection.shot_folder(scene)
     if not name or folder is None:
         return None
-    turns = own_camera.sample_path(scene, name, folder, _asked(scene, step).width)
+    turns = own_camera.sample_path(scene, name, folder, _step_params(scene, step).width)
     while True:
         try:
             next(turns)
@@ -224,7 +224,7 @@ def read_camera(scene: bpy.types.Scene, step: str) -> contract.FreezeParams | No
 def read_in_turns(scene: bpy.types.Scene, shot: Path, step: str) -> None:
     """Reads the artist's camera in steps run by the timer, then starts the Freeze or Bake step."""
     job_timer.watch_of(shot).notes.clear()
-    turns = own_camera.sample_path(scene, own_camera.name_of(scene), shot, _asked(scene, step).width)
+    turns = own_camera.sample_path(scene, own_camera.name_of(scene), shot, _step_params(scene, step).width)
     total = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
     job_timer.work(shot, step, reading(scene.session_uid, shot, step, turns, total))
 

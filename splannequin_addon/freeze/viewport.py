@@ -35,7 +35,7 @@ _REST_SECONDS = 0.35
 _session: live.Session | None = None
 _handler: Any = None
 _shader: Any = None
-_told: tuple[str, str] | None = None
+_failure: tuple[str, str] | None = None
 """(sentence, hint) about the end of the last session, or None."""
 _shown: dict[int, tuple[int, Any, Any]] = {}
 """View -> (seq of the frame, texture of its colour, texture of its depth)."""
@@ -52,19 +52,19 @@ def session() -> live.Session | None:
 
 def failure() -> tuple[str, str] | None:
     """(sentence, hint) about the failure of the last session; None if it did not fail."""
-    return _told
+    return _failure
 
 
 def begin(scene: bpy.types.Scene) -> None:
     """Starts to draw the scene's run. Raises JobError without a run, a backend or a window."""
-    global _session, _handler, _told
+    global _session, _handler, _failure
     if bpy.app.background:
         raise contract.JobError("There is no view to draw in.", "Use Freeze.", contract.ExitCode.USAGE)
     shot, run = selection.shot_folder(scene), settings_of(scene).run_name
     if shot is None or not contract.RunFolder(contract.ShotFolder(shot).runs / run).checkpoint.is_file():
         raise contract.JobError(f"There is no trained run {run!r}.", "Train first.", contract.ExitCode.USAGE)
     end()
-    _told = None
+    _failure = None
     _session = live.open_session(shot, run, backend.python(), backend.package_root())
     hidden_points.begin(scene, shot)  # the points would cover the image
     _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
@@ -145,16 +145,16 @@ def redraw(kinds: tuple[str, ...] = ("WINDOW", "UI")) -> None:
 
 
 _last: tuple[int, tuple[Any, ...]] = (-1, ())
-_last_told: tuple[str, ...] = ()
+_last_reasons: tuple[str, ...] = ()
 
 
 def _tick() -> float | None:
     """Redraws when a frame has arrived, when t* has changed, or when a view has come to rest. Ends with the session."""
-    global _told, _last, _last_told
+    global _failure, _last, _last_reasons
     if _session is None:
         return None
     if _session.failure is not None:
-        _told = _session.failure
+        _failure = _session.failure
         end()
         return None
     scenes = selection.scenes_of(_session.shot)
@@ -182,8 +182,8 @@ def _tick() -> float | None:
         _last = state
         redraw(("WINDOW",))
     reasons = tuple(reason(s) for s in scenes)
-    if reasons != _last_told and not _moving(now):
-        _last_told = reasons
+    if reasons != _last_reasons and not _moving(now):
+        _last_reasons = reasons
         redraw(("UI",))
     return TICK_SECONDS
 
@@ -220,13 +220,13 @@ def view_of(
     return contract.LiveView(0, 0, viewmat, K, width, height, t_star, show=settings_of(scene).live_show)
 
 
-def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
+def _same(first: contract.LiveView, second: contract.LiveView) -> bool:
     """True if both requests have the same content, regardless of size and plate detail."""
-    instants = [(v.t_star, v.show, v.exposed_like, v.develop) for v in (one, other)]
+    instants = [(v.t_star, v.show, v.exposed_like, v.develop) for v in (first, second)]
     if instants[0] != instants[1]:
         return False
-    ks = [np.array(v.K) / (v.width, v.height, v.width, v.height) for v in (one, other)]
-    return bool(np.allclose(ks[0], ks[1], atol=2e-3) and np.allclose(one.viewmat, other.viewmat, atol=1e-6))
+    ks = [np.array(v.K) / (v.width, v.height, v.width, v.height) for v in (first, second)]
+    return bool(np.allclose(ks[0], ks[1], atol=2e-3) and np.allclose(first.viewmat, second.viewmat, atol=1e-6))
 
 
 def _draw() -> None:
@@ -275,11 +275,11 @@ def _paint(key: int, frame: live.Frame, view: bpy.types.RegionView3D, scale: flo
     """Draws a frame over the region, with a depth for each pixel."""
     shader = _shader_of()
     seq, colour, depth = _shown.get(key, (-1, None, None))
-    if seq != frame.asked.seq:
+    if seq != frame.request.seq:
         h, w = frame.depth.shape
         colour = gpu.types.GPUTexture((w, h), format="RGBA16F", data=_buffer(frame.rgba))  # pyright: ignore[reportCallIssue]
         depth = gpu.types.GPUTexture((w, h), format="R32F", data=_buffer(frame.depth * np.float32(scale)))  # pyright: ignore[reportCallIssue]
-        _shown[key] = (frame.asked.seq, colour, depth)
+        _shown[key] = (frame.request.seq, colour, depth)
     window = view.window_matrix
     batch = batch_for_shader(shader, "TRI_STRIP", {"pos": ((-1, -1), (1, -1), (-1, 1), (1, 1))})
     gpu.state.blend_set("ALPHA_PREMULT")

@@ -26,7 +26,7 @@ _READ_SECONDS = 5.0
 class Chain:
     """The remaining steps of a shot that are run one after the other."""
 
-    ahead: list[str]
+    remaining: list[str]
     """Names of the steps still to be started, in order."""
     way: contract.TotalProgress
     """Estimated durations of the steps."""
@@ -63,14 +63,14 @@ def missing(scene: bpy.types.Scene) -> list[str]:
 
 def begin(scene: bpy.types.Scene, shot: Path) -> None:
     """Starts the first missing step; the timer starts the others. Without a window, all steps have ended on return."""
-    ahead = missing(scene)
-    chain = _chains[shot] = Chain(ahead, contract.TotalProgress(_expected(scene, shot, ahead)))
+    remaining = missing(scene)
+    chain = _chains[shot] = Chain(remaining, contract.TotalProgress(_expected(scene, shot, remaining)))
     if not bpy.app.background:
         _begin_next(chain, scene)
-        job_timer.meanwhile(lambda: _turn(shot, chain))
+        job_timer.call_until_false(lambda: _turn(shot, chain))
         return
     try:
-        while chain.ahead:
+        while chain.remaining:
             _begin_next(chain, scene)
             if _failed(job_timer.watch_of(shot), chain.step):
                 return
@@ -105,7 +105,7 @@ def _turn(shot: Path, chain: Chain) -> bool:
     scenes = selection.scenes_of(shot)
     if not scenes and selection.scenes_with(shot) and not _failed(watch, chain.step):
         return True  # until the shot is selected again
-    if not scenes or not chain.ahead or _failed(watch, chain.step):
+    if not scenes or not chain.remaining or _failed(watch, chain.step):
         stop(shot)
         job_timer.redraw()
         return False
@@ -116,7 +116,7 @@ def _turn(shot: Path, chain: Chain) -> bool:
 
 def _begin_next(chain: Chain, scene: bpy.types.Scene) -> None:
     """Runs the operator of the next step. The step's panel shows any error."""
-    chain.step, chain.began = chain.ahead.pop(0), time.monotonic()
+    chain.step, chain.began = chain.remaining.pop(0), time.monotonic()
     ops: Any = bpy.ops  # our operators are not in the stubs
     window = job_timer.window_of(scene) or next(iter(bpy.context.window_manager.windows), None)
     with contextlib.suppress(RuntimeError):  # raised by Blender for errors that an operator reports

@@ -63,7 +63,7 @@ def python() -> str:
     for where, path in candidates():
         chosen = where in ("the add-on's preferences", PYTHON_VARIABLE)
         if path.is_file():
-            trouble = _wrong_with(path)
+            trouble = _environment_problem(path)
             if not trouble:
                 return str(path)
             wrong = wrong or trouble
@@ -89,10 +89,10 @@ def python() -> str:
     )
 
 
-def _wrong_with(python: Path) -> str:
+def _environment_problem(python: Path) -> str:
     """Sentence why an interpreter's environment cannot be used; empty if it can."""
     folder = python.parent.parent
-    if environment.half_made(python):
+    if environment.is_incomplete(python):
         return f"The backend's set-up has not finished: the environment in {folder} is half-made."
     changed = ", ".join(environment.changed(python))
     return f"The backend in {folder} was changed since it was set up: {changed}." if changed else ""

@@ -22,7 +22,7 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
     Raises:
         contract.JobError: no shot is selected, there is no backend, or the shot cannot be written.
     """
-    selection.look_again()
+    selection.clear_cache()
     params = params or steps.STEPS[step].params(scene)
     folder = needed(scene, step)
     backend.python()  # fails before anything is written
@@ -66,12 +66,12 @@ def remove_all(scene: bpy.types.Scene, shot: Path) -> list[str]:
 
     Objects of the scene's other shots stay. While any other shot has some, the scene's settings stay, too.
     """
-    others = [f for f in selection.folders(scene) if f is not None and f != shot]
-    others = [f for f in others if any(step.stands(scene, f) for step in steps.STEPS.values())]
+    remaining = [f for f in selection.folders(scene) if f is not None and f != shot]
+    remaining = [f for f in remaining if any(step.is_present(scene, f) for step in steps.STEPS.values())]
     done: list[str] = []
     for step in reversed(steps.STEPS.values()):
-        done += step.remove(scene, shot, others)
-    if others:
+        done += step.remove(scene, shot, remaining)
+    if remaining:
         return done
     if markers.remove(scene):
         done.append("The marker t* was removed.")

@@ -59,7 +59,7 @@ class Question:
     """A backend process that answers one question while Blender continues."""
 
     process: subprocess.Popen[str]
-    _told: tuple[str, str] = ("", "")
+    _printed: tuple[str, str] = ("", "")
     """Its standard output and standard error."""
 
     def __post_init__(self) -> None:
@@ -68,7 +68,7 @@ class Question:
         self._reader.start()
 
     def _listen(self) -> None:
-        self._told = self.process.communicate()
+        self._printed = self.process.communicate()
 
     @property
     def ended(self) -> bool:
@@ -95,15 +95,15 @@ class Question:
             code: exit code of that error; None: the process's code.
         """
         self._reader.join()
-        out, errors = self._told
+        out, errors = self._printed
         if not self.process.returncode:
             return out
         last = (errors.strip().splitlines() or ["the backend gave no reason"])[-1]
         known = self.process.returncode in {one.value for one in contract.ExitCode}
         if known and last.startswith("Error: ") and code is None:
             raise contract.JobError(last.removeprefix("Error: "), "", self.process.returncode)
-        own = self.process.returncode if known else contract.ExitCode.INTERNAL
-        raise contract.JobError(failed.format(last.removeprefix("Error: ")), hint, own if code is None else code)
+        exit_code = self.process.returncode if known else contract.ExitCode.INTERNAL
+        raise contract.JobError(failed.format(last.removeprefix("Error: ")), hint, exit_code if code is None else code)
 
 
 def ask(python: str, package_root: Path, *words: str) -> Question:
@@ -119,7 +119,7 @@ def ask(python: str, package_root: Path, *words: str) -> Question:
     return Question(child)
 
 
-def import_beside(name: str) -> None:
+def import_in_background(name: str) -> None:
     """Imports a module in a thread, so that the main thread does not wait for the disk later."""
     threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()
 

@@ -61,7 +61,7 @@ class SetUp:
     folder: Path
     """Folder that contains the environment."""
     process: subprocess.Popen[bytes] | None = None
-    said: list[str] = field(default_factory=list[str])
+    output: list[str] = field(default_factory=list[str])
     """Last lines of its output."""
     failure: str = ""
     """Why the set-up failed; empty if it did not."""
@@ -113,7 +113,7 @@ def start(folder: Path, python: str, package_root: Path, wheels: Path | None = N
 
 def poll(setup: SetUp) -> bool:
     """Reads new output of a set-up. True if something changed."""
-    before = (list(setup.said), setup.running)
+    before = (list(setup.output), setup.running)
     try:
         with open(setup.log, "rb") as log:
             log.seek(0, os.SEEK_END)
@@ -121,12 +121,12 @@ def poll(setup: SetUp) -> bool:
             lines = log.read().decode("utf-8", "replace").splitlines()
     except OSError:
         lines = []
-    setup.said = [line.strip() for line in lines if line.strip()][-_SHOWN:]
+    setup.output = [line.strip() for line in lines if line.strip()][-_SHOWN:]
     code = setup.process.poll() if setup.process is not None else 0
     if code is not None:
         setup.running = False
         setup.failure = "" if code == 0 else _why(setup, code)
-    return before != (setup.said, setup.running)
+    return before != (setup.output, setup.running)
 
 
 def _why(setup: SetUp, code: int) -> str:
@@ -134,7 +134,7 @@ def _why(setup: SetUp, code: int) -> str:
         error = str(contract.read_json(setup.summary).get("error", ""))
     except (OSError, ValueError):
         error = ""
-    return error or f"The set-up ended with exit code {code}: {' '.join(setup.said[-1:])}"
+    return error or f"The set-up ended with exit code {code}: {' '.join(setup.output[-1:])}"
 
 
 def cancel(setup: SetUp) -> None:
@@ -143,7 +143,7 @@ def cancel(setup: SetUp) -> None:
         setup.process.terminate()
 
 
-def half_made(python: Path) -> bool:
+def is_incomplete(python: Path) -> bool:
     """True if the launcher has started but not finished an interpreter's environment. An environment without the
     launcher's notes counts as finished.
 
@@ -190,12 +190,12 @@ def remove(folder: Path, wait: bool = False) -> bool:
         return False
     if not (environment / contract.SETUP_NOTES).is_dir():
         raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
-    _nobody_in(environment)
+    _require_unused(environment)
     # Rename first, so that no partly deleted folder counts as an environment after an interruption.
     renamed = folder / f"{_REMOVED}{uuid.uuid4().hex[:8]}"
     os.replace(environment, renamed)
     try:
-        _nobody_in(environment)  # a process that started after the check uses the old path
+        _require_unused(environment)  # a process that started after the check uses the old path
     except AtWork:
         os.replace(renamed, environment)
         raise
@@ -207,7 +207,7 @@ def remove(folder: Path, wait: bool = False) -> bool:
     return True
 
 
-def _nobody_in(environment: Path) -> None:
+def _require_unused(environment: Path) -> None:
     for pid in contract.run_from(environment):
         raise AtWork(pid)
 

@@ -107,7 +107,7 @@ class Watch:
 
 
 _watches: dict[Path, Watch] = {}
-_meanwhile: list[Callable[[], bool]] = []
+_callbacks: list[Callable[[], bool]] = []
 """Callbacks that the timer calls each time it examines jobs, until they return False."""
 _pulses: list[Callable[[], float | None]] = []
 """Callbacks that are called more often than jobs are examined."""
@@ -177,7 +177,7 @@ def stop_work(watch: Watch) -> bool:
     watch.work = None
     if isinstance(turns, Generator):
         turns.close()
-    sequences.forget_ahead()  # images loaded ahead may be outdated when they are needed
+    sequences.clear_prefetched()  # images loaded ahead may be outdated when they are needed
     return True
 
 
@@ -195,9 +195,9 @@ def _work_on(watch: Watch, doing: Work) -> None:
         watch.just_ended = doing.step
 
 
-def meanwhile(turn: Callable[[], bool]) -> None:
+def call_until_false(turn: Callable[[], bool]) -> None:
     """Makes the timer call `turn` at each check of jobs until it returns False."""
-    _meanwhile.append(turn)
+    _callbacks.append(turn)
 
 
 def when_answered(question: children.Question, then: Callable[[], None]) -> None:
@@ -210,7 +210,7 @@ def when_answered(question: children.Question, then: Callable[[], None]) -> None
             return False
         return True
 
-    meanwhile(look)
+    call_until_false(look)
 
 
 def refresh(watch: Watch) -> bool:
@@ -222,7 +222,7 @@ def refresh(watch: Watch) -> bool:
             return False
         watch.stamp = stamp
         watch.state = inventory.read(watch.shot)
-        selection.look_again()
+        selection.clear_cache()
     except (OSError, ValueError, KeyError) as error:
         # Try again later: a network disk may return, or a file was being replaced on Windows.
         watch.state, watch.stamp = ShotState(watch.shot), ()
@@ -295,14 +295,14 @@ def _follow_jobs() -> float:
                 traceback.print_exc()
             watch.failures[step] = (message, "The console has the details.")
             changed = True
-    for turn in list(_meanwhile):
+    for turn in list(_callbacks):
         try:
             goes_on = turn()
         except Exception:  # as above
             traceback.print_exc()
             goes_on = False
         if not goes_on:
-            _meanwhile.remove(turn)
+            _callbacks.remove(turn)
     if changed:
         redraw()
     works = any(w.work is not None and w.work.turns is not None for w in _watches.values())
@@ -323,9 +323,9 @@ def _turn(watch: Watch, until: float) -> bool:
         if job.ended or time.monotonic() > until:
             continue
         try:
-            before = _told(job)
+            before = _shown_state(job)
             jobs.poll(job, max(until - time.monotonic(), 0.001))
-            changed |= before != _told(job)
+            changed |= before != _shown_state(job)
         except (OSError, ValueError, KeyError) as error:
             watch.failures[step] = (f"The job in {job.folder} cannot be read: {error}", "")
             del watch.jobs[step]
@@ -364,7 +364,7 @@ def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
         _apply(watch, step, job)
 
 
-def _told(job: jobs.Job) -> tuple[Any, ...]:
+def _shown_state(job: jobs.Job) -> tuple[Any, ...]:
     """The state of a job that the panel shows."""
     status = job.status
     shown = (status.state, status.stage, round(status.fraction, 2), status.message) if status is not None else ()
@@ -448,7 +448,7 @@ def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
 def _on_load(*_: object) -> None:
     """Handler: another file was loaded. Its shots are examined again; running jobs continue and are found again."""
     markers.forget()
-    sequences.forget_ahead()
+    sequences.clear_prefetched()
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     redraw()
@@ -460,7 +460,7 @@ def _on_load(*_: object) -> None:
 def forget() -> None:
     """Clears all stored state. It is read again from the shots' folders when needed."""
     _watches.clear()
-    _meanwhile.clear()
+    _callbacks.clear()
     _pulses.clear()
 
 

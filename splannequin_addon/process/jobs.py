@@ -22,7 +22,7 @@ from typing import Any
 from ...torch_backend import contract
 from . import children
 
-_LAST_WORD_SECONDS = 10.0
+_EXIT_SECONDS = 10.0
 """Maximum time to wait for a job's process after its last status."""
 _START_SECONDS = 30.0
 """Age after which a job without a status counts as never started."""
@@ -65,7 +65,7 @@ class Job:
     """Label -> path of the latest image."""
     result: Any = None
     """Result in the job's `done` event."""
-    end: tuple[str, _Words] | None = None
+    end: tuple[str, _Message] | None = None
     """Final state and message of the job according to its events."""
     cameras_known: bool = False
     """True for a solve that has written the shot's cameras, even if it still runs."""
@@ -156,20 +156,20 @@ def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
         status = _read_status(job.folder) or status  # the job may have ended between the two reads above
         events += _read_events(job, until + 1.0)[0]
         if status is None or not status.ended:
-            status = _declare_dead(job, status)
+            status = _mark_failed(job, status)
     job.status = status
     return events
 
 
-def _last_words(job: Job, status: contract.Status | None) -> contract.Status | None:
+def _final_status(job: Job, status: contract.Status | None) -> contract.Status | None:
     """The final status from the job's events, if the job could not write it because its shot was moved or deleted."""
     if job.end is None:
         return None
     now = time.time()
     status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
-    state, words = job.end
+    state, error = job.end
     status.state = state if state in ("done", "failed", "cancelled") else "failed"
-    status.message, status.hint, status.exit_code, status.eta_seconds = words.message, words.hint, words.exit_code, None
+    status.message, status.hint, status.exit_code, status.eta_seconds = error.message, error.hint, error.exit_code, None
     return status
 
 
@@ -184,7 +184,7 @@ def is_alive(job: Job, status: contract.Status | None) -> bool:
     if status is None or not status.pid:
         return _age(job.folder) < _START_SECONDS
     if status.host and status.host != contract.computer_name():
-        return _holds(job) or not _silent(job, status)
+        return _has_lock(job) or not _is_silent(job, status)
     if status.host or (status.process_started and sys.platform == "linux"):
         return contract.runs_still(status.pid, status.process_started)
     return time.time() - status.heartbeat < _SILENT_SECONDS  # an older backend did not record its host
@@ -209,7 +209,7 @@ def refuse_second_writer(shot: Path) -> None:
             )
 
 
-def _holds(job: Job) -> bool:
+def _has_lock(job: Job) -> bool:
     """True if the job holds the shot's lock, or if the lock cannot be read."""
     try:
         writer = contract.read_writer(job.shot)
@@ -218,7 +218,7 @@ def _holds(job: Job) -> bool:
     return writer is not None and writer.job == job.folder.name
 
 
-def _silent(job: Job, status: contract.Status) -> bool:
+def _is_silent(job: Job, status: contract.Status) -> bool:
     """True if a job's heartbeat has not changed while this Blender watched. Does not rely on another computer's
     clock."""
     now = time.monotonic()
@@ -261,7 +261,7 @@ def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> 
     if job.process is not None:
         # The job releases the shot's lock after its last status. On a busy machine the next step could find it locked.
         with contextlib.suppress(subprocess.TimeoutExpired):
-            job.process.wait(_LAST_WORD_SECONDS)
+            job.process.wait(_EXIT_SECONDS)
     raise_if_failed(job)
     return job.result
 
@@ -294,8 +294,8 @@ def latest(shot: Path) -> dict[str, Job]:
     found: dict[str, Job] = {}
     jobs_folder = contract.ShotFolder(shot).jobs
     # A link would lead to the jobs of another shot, into which this add-on must not write.
-    is_own = shot.is_dir() and not contract.is_link(jobs_folder)
-    folders = sorted(jobs_folder.glob("*/"), key=lambda p: p.name, reverse=True) if is_own else []
+    is_local = shot.is_dir() and not contract.is_link(jobs_folder)
+    folders = sorted(jobs_folder.glob("*/"), key=lambda p: p.name, reverse=True) if is_local else []
     for folder in folders:
         if contract.is_link(folder):
             continue
@@ -351,7 +351,7 @@ def _read_events(job: Job, until: float) -> tuple[list[contract.Event], bool]:
             for line, job.read_to in lines:
                 event = _event(line)
                 if event is not None:
-                    _take_in(job, event)
+                    _apply_event(job, event)
                     events.append(event)
                 if time.monotonic() > until:
                     return events, False
@@ -371,40 +371,40 @@ def _event(line: bytes) -> contract.Event | None:
 
 
 @dataclass
-class _Words:
+class _Message:
     message: str
     hint: str = ""
     exit_code: int = 1
 
 
 @dataclass
-class _Figures:
+class _Metrics:
     values: dict[str, Any]
     stage: str = ""
 
 
 @dataclass
-class _Picture:
+class _Image:
     label: str
     path: str
 
 
 @dataclass
-class _End:
+class _Result:
     state: str = "done"
     result: Any = None
 
 
 _EVENT_DATA: dict[str, type] = {
-    "warning": _Words, "error": _Words, "metric": _Figures, "image": _Picture, "done": _End,
+    "warning": _Message, "error": _Message, "metric": _Metrics, "image": _Image, "done": _Result,
 }  # fmt: skip
 """Type of event -> its required fields. Events of other types are only passed on."""
 
 
-def _take_in(job: Job, event: contract.Event) -> None:
+def _apply_event(job: Job, event: contract.Event) -> None:
     if event.type == "warning":
-        words = _Words(**event.data)
-        job.warnings.append((contract.printable(words.message), contract.printable(words.hint)))
+        message = _Message(**event.data)
+        job.warnings.append((contract.printable(message.message), contract.printable(message.hint)))
     elif event.type == "metric":
         values = event.data["values"]
         job.metrics.update(values)
@@ -415,18 +415,18 @@ def _take_in(job: Job, event: contract.Event) -> None:
     elif event.type == "image":
         job.images[event.data["label"]] = event.data["path"]
     elif event.type == "error":
-        words = _Words(**event.data)
-        words.message, words.hint = contract.printable(words.message), contract.printable(words.hint)
-        job.end = ("failed", words)
+        message = _Message(**event.data)
+        message.message, message.hint = contract.printable(message.message), contract.printable(message.hint)
+        job.end = ("failed", message)
     elif event.type == "done":
         job.result = event.data.get("result")
-        job.end = (_End(**event.data).state, job.end[1] if job.end else _Words("", exit_code=0))
+        job.end = (_Result(**event.data).state, job.end[1] if job.end else _Message("", exit_code=0))
 
 
-def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
-    message = _last_words(job, status)
-    if message is not None:
-        return _keep(job, message)
+def _mark_failed(job: Job, status: contract.Status | None) -> contract.Status:
+    final = _final_status(job, status)
+    if final is not None:
+        return _keep(job, final)
     now = time.time()
     status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
     if not job.folder.is_dir():
@@ -459,12 +459,12 @@ def _keep(job: Job, status: contract.Status) -> contract.Status:
 
 def _age(folder: Path) -> float:
     """Age of a job in seconds, by the clock of its disk, because another computer may have created it."""
-    now, made = time.time(), 0.0
+    now, created = time.time(), 0.0
     with contextlib.suppress(OSError):
         now = contract.disk_time(folder)
     with contextlib.suppress(OSError):
-        made = (folder / contract.REQUEST_FILE).stat().st_mtime
-    return now - made
+        created = (folder / contract.REQUEST_FILE).stat().st_mtime
+    return now - created
 
 
 def _kill(job: Job) -> None:

@@ -51,8 +51,8 @@ class Part(Protocol):
 class Panel(Protocol):
     """Draws a step in the sidebar tab."""
 
-    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_at_hand: bool) -> None:
-        """Draws the header, and the body if it is open. `is_at_hand` marks the step to work on."""
+    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_current: bool) -> None:
+        """Draws the header, and the body if it is open. `is_current` marks the step to work on."""
 
 
 class Step:
@@ -132,13 +132,13 @@ class Step:
         """The reason why a run or take of a shot cannot be deleted now; empty if it can."""
         return ""
 
-    def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
+    def is_present(self, scene: bpy.types.Scene, shot: Path) -> bool:
         """True if the scene has objects or settings of a shot."""
         return False
 
-    def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
-        """Removes the step's results for a shot from the scene, except those that the shots `others` need. Returns the
-        changes."""
+    def remove(self, scene: bpy.types.Scene, shot: Path, remaining: list[Path]) -> list[str]:
+        """Removes the step's results for a shot from the scene, except those that the shots `remaining` need. Returns
+        the changes."""
         return []
 
     def scaled(self, scene: bpy.types.Scene, shot: Path) -> list[str]:

@@ -25,9 +25,9 @@ def relative(path: str, base: str) -> str:
         return path
 
 
-def same(one: str, other: str) -> bool:
+def same(first: str, second: str) -> bool:
     """True if two absolute paths are equal by the system's rules: on Windows `c:` is `C:`."""
-    return os.path.normcase(one) == os.path.normcase(other)
+    return os.path.normcase(first) == os.path.normcase(second)
 
 
 def absolute(path: str) -> str:

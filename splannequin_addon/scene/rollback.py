@@ -36,8 +36,8 @@ def scene_of(scene: bpy.types.Scene) -> Generator[None, None, None]:
     values = {(o, name): getattr(_owner(scene, o), name) for o, name in names if hasattr(_owner(scene, o), name)}
     camera = scene.camera.session_uid if scene.camera is not None else None
     switches = compat.compositor_switches(scene)
-    own = {key: scene[key] for key in scene.keys() if key.startswith("splannequin_")}  # noqa: SIM118
-    made = len(settings_of(scene).made)
+    custom_properties = {key: scene[key] for key in scene.keys() if key.startswith("splannequin_")}  # noqa: SIM118
+    entry_count = len(settings_of(scene).made)
     try:
         yield
     except BaseException:
@@ -50,10 +50,10 @@ def scene_of(scene: bpy.types.Scene) -> Generator[None, None, None]:
         compat.restore_compositor_switches(scene, switches)
         for key in [k for k in scene.keys() if k.startswith("splannequin_")]:  # noqa: SIM118
             del scene[key]
-        for key, value in own.items():
+        for key, value in custom_properties.items():
             scene[key] = value
-        while len(settings_of(scene).made) > made:
-            settings_of(scene).made.remove(made)
+        while len(settings_of(scene).made) > entry_count:
+            settings_of(scene).made.remove(entry_count)
         raise
 
 

@@ -33,26 +33,26 @@ def shows(data: bpy.types.Image | bpy.types.MovieClip | None, footage: Iterable[
     return any(_same_file(path, known, by_content=is_moving) for known in footage)
 
 
-def _same_file(one: Path, other: Path, by_content: bool) -> bool:
+def _same_file(path: Path, known: Path, by_content: bool) -> bool:
     """True if two paths lead to the same file, or, with `by_content`, to equal copies."""
-    if _place(one) == _place(other):
+    if _place(path) == _place(known):
         return True
     try:
-        if os.path.samefile(one, other):
+        if os.path.samefile(path, known):
             return True
-        sizes = one.stat().st_size, other.stat().st_size
-        if not by_content or not (one.is_file() and other.is_file()) or sizes[0] != sizes[1] or not sizes[0]:
+        sizes = path.stat().st_size, known.stat().st_size
+        if not by_content or not (path.is_file() and known.is_file()) or sizes[0] != sizes[1] or not sizes[0]:
             return False
-        return contract.file_digest(one) == contract.file_digest(other)
+        return contract.file_digest(path) == contract.file_digest(known)
     except (OSError, ValueError):  # one of the files is missing or unreadable
         return False
 
 
-def _same_sequence(one: Path, other: Path) -> bool:
+def _same_sequence(path: Path, known: Path) -> bool:
     """True if two paths name images of the same sequence, or of equal copies."""
-    if _folder_of(one, other):
+    if _folder_of(path, known):
         return True
-    first, second = _pictures(one), _pictures(other)
+    first, second = _pictures(path), _pictures(known)
     if first is None or second is None:
         return False
     if _place(first[0]) == _place(second[0]) and first[1] == second[1]:

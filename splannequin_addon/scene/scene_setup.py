@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _BEFORE = "splannequin_settings_before"
 _OURS = "splannequin_settings_ours"
-_TOGETHER = (
+_COUPLED = (
     {"resolution_x", "resolution_y", "resolution_percentage"},
     {"pixel_aspect_x", "pixel_aspect_y"},
     {"fps", "fps_base"},
@@ -66,20 +66,20 @@ def fit_clip(
     """
     render = scene.render
     changes: list[str] = []
-    spared = set[str]() if over else {name for names in _touched(scene).values() for name in names}
+    excluded = set[str]() if over else {name for names in _touched(scene).values() for name in names}
     aspect = axes.pixel_aspect(k) if k else (render.pixel_aspect_x, render.pixel_aspect_y)
     now = (render.resolution_x, render.resolution_y, render.resolution_percentage)
-    if size is not None and now != (*size, 100) and "resolution_x" not in spared:
+    if size is not None and now != (*size, 100) and "resolution_x" not in excluded:
         _set(scene, "render", {"resolution_x": size[0], "resolution_y": size[1], "resolution_percentage": 100})
         changes.append(f"Resolution set to {size[0]} x {size[1]}.")
-    if (render.pixel_aspect_x, render.pixel_aspect_y) != aspect and "pixel_aspect_x" not in spared:
+    if (render.pixel_aspect_x, render.pixel_aspect_y) != aspect and "pixel_aspect_x" not in excluded:
         _set(scene, "render", {"pixel_aspect_x": aspect[0], "pixel_aspect_y": aspect[1]})
         changes.append("Pixel aspect set to the lens's.")
-    if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4 and "fps" not in spared:
+    if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4 and "fps" not in excluded:
         whole = max(round(fps), 1)
         _set(scene, "render", {"fps": whole, "fps_base": whole / fps})
         changes.append(f"Frame rate set to {fps:g}.")
-    if (scene.frame_start, scene.frame_end) != frames and "frame_start" not in spared:
+    if (scene.frame_start, scene.frame_end) != frames and "frame_start" not in excluded:
         _set(scene, "scene", {"frame_start": frames[0], "frame_end": frames[1]})
         changes.append(f"Frame range set to {frames[0]} to {frames[1]}.")
     if not frames[0] <= scene.frame_current <= frames[1]:
@@ -91,8 +91,8 @@ def kept(scene: bpy.types.Scene) -> str:
     """JSON with the scene's size, rate and range, and the values of them set by this module. Input of `put_back`."""
     ours = json.loads(scene.get(_OURS, "{}"))
     now = {owner: {name: getattr(_owner(scene, owner), name) for name in names} for owner, names in _SHOTS.items()}
-    set_here = {o: {n: v for n, v in ours.get(o, {}).items() if n in names} for o, names in _SHOTS.items()}
-    return json.dumps({"now": now, "ours": set_here})
+    set_values = {o: {n: v for n, v in ours.get(o, {}).items() if n in names} for o, names in _SHOTS.items()}
+    return json.dumps({"now": now, "ours": set_values})
 
 
 def put_back(scene: bpy.types.Scene, was: str) -> None:
@@ -105,8 +105,8 @@ def put_back(scene: bpy.types.Scene, was: str) -> None:
         _set(scene, owner, different)
     ours = json.loads(scene[_OURS])
     for owner, names in _SHOTS.items():
-        others = {n: v for n, v in ours.get(owner, {}).items() if n not in names}
-        ours[owner] = others | stored["ours"].get(owner, {})
+        unrelated = {n: v for n, v in ours.get(owner, {}).items() if n not in names}
+        ours[owner] = unrelated | stored["ours"].get(owner, {})
     scene[_OURS] = json.dumps(ours)
     if not scene.frame_start <= scene.frame_current <= scene.frame_end:
         scene.frame_set(scene.frame_start)
@@ -209,16 +209,16 @@ def restore(scene: bpy.types.Scene) -> bool:
 def _touched(scene: bpy.types.Scene) -> dict[str, set[str]]:
     """Owner -> settings that were set here and changed by the artist since, with the settings that belong to them."""
     found: dict[str, set[str]] = {}
-    for owner, set_here in json.loads(scene.get(_OURS, "{}")).items():
-        touched = {n for n, v in set_here.items() if not _same(getattr(_owner(scene, owner), n), v)}
-        for group in _TOGETHER:
+    for owner, set_values in json.loads(scene.get(_OURS, "{}")).items():
+        touched = {n for n, v in set_values.items() if not _same(getattr(_owner(scene, owner), n), v)}
+        for group in _COUPLED:
             touched |= group if touched & group else set()
         found[owner] = touched
     return found
 
 
-def _same(one: Any, other: Any) -> bool:
-    return abs(one - other) < 1e-5 if isinstance(other, float) else bool(one == other)
+def _same(first: Any, second: Any) -> bool:
+    return abs(first - second) < 1e-5 if isinstance(second, float) else bool(first == second)
 
 
 def _owner(scene: bpy.types.Scene, name: str) -> Any:

@@ -16,13 +16,13 @@ from .ownership import TAG
 
 Encoding = str | tuple[float, ...]
 """Encoding of a file's values, in the form that `compat.colour_space` accepts."""
-_ahead: set[str] = set()
+_prefetched: set[str] = set()
 """Files that `read` and `read_numbers` have just loaded. The next load function uses them without a reload."""
 
 
-def forget_ahead() -> None:
+def clear_prefetched() -> None:
     """Clears the record of images loaded ahead. Call it when another file is loaded."""
-    _ahead.clear()
+    _prefetched.clear()
 
 
 def read(
@@ -32,16 +32,16 @@ def read(
 
     `opaque`: see `load_sequence`; `shift`: see `show_sequence`.
     """
-    _ahead.discard(os.path.abspath(path))
+    _prefetched.discard(os.path.abspath(path))
     shown_size(load_sequence(path, name, encoding, opaque), first, last, shift)
-    _ahead.add(os.path.abspath(path))
+    _prefetched.add(os.path.abspath(path))
 
 
 def read_numbers(path: Path, name: str) -> None:
     """Loads an image of numbers, as `read` does for colours."""
-    _ahead.discard(os.path.abspath(path))
+    _prefetched.discard(os.path.abspath(path))
     size_of(load_numbers(path, name))
-    _ahead.add(os.path.abspath(path))
+    _prefetched.add(os.path.abspath(path))
 
 
 def shown_size(image: bpy.types.Image, first: int, last: int, shift: int = 0) -> tuple[int, int]:
@@ -68,9 +68,9 @@ def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = Fals
         if image.get(TAG) and paths.same(paths.absolute(image.filepath), wanted):
             compat.set_image_colour(image, encoding)  # another import may have used another encoding
             _make_opaque(image, opaque)
-            if wanted not in _ahead:
+            if wanted not in _prefetched:
                 image.reload()
-            _ahead.discard(wanted)
+            _prefetched.discard(wanted)
             return image
     compat.colour_space(encoding)  # fails before anything is created if the configuration lacks the space
     image = bpy.data.images.load(contract.regular_file(wanted, None))
@@ -95,9 +95,9 @@ def load_numbers(path: Path, name: str) -> bpy.types.Image:
     wanted = os.path.abspath(path)
     for known in bpy.data.images:
         if known.get(TAG) and paths.same(paths.absolute(known.filepath), wanted):
-            if wanted not in _ahead:
+            if wanted not in _prefetched:
                 known.reload()
-            _ahead.discard(wanted)
+            _prefetched.discard(wanted)
             return known
     image = bpy.data.images.load(contract.regular_file(wanted))
     image.name = name

@@ -102,7 +102,7 @@ def params_of(config: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def other_cameras(shot: Path, run: Path) -> bool:
+def has_new_cameras(shot: Path, run: Path) -> bool:
     """True if the shot was solved again with another result after the run was trained."""
     cameras, folder = contract.ShotFolder(shot).cameras, RunFolder(run)
     try:

@@ -44,7 +44,7 @@ def read(folder: Path) -> ShotState:
     state.info = _typed(_Info, paths.info_path)
     if paths.listing.is_file():
         listing = file_cache.of(paths.listing, _listed)
-        state.frames, state.beside, state.read_as, state.timecode, state.shift = listing
+        state.frames, state.relative_source, state.read_as, state.timecode, state.shift = listing
     if paths.cameras.is_file():
         state.solve = _typed(_Solve, paths.solve_record)
         state.lacks_motion = _is_unfinished(paths.motion)
@@ -61,11 +61,11 @@ def read(folder: Path) -> ShotState:
         place = contract.RunFolder(paths.runs / name)
         run["anew"] = checkpoints.anew(place.root)
         if run["anew"] is not None:
-            run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
+            run["anew"]["has_new_cameras"] = checkpoints.has_new_cameras(folder, run["anew"]["folder"])
             instead = contract.RunFolder(run["anew"]["folder"])
             run["anew"]["history"] = _history(instead.metrics)
             run["anew"]["preview"] = max(instead.previews.glob("*.png"), default=None)
-        run["other_cameras"] = checkpoints.other_cameras(folder, place.root)
+        run["has_new_cameras"] = checkpoints.has_new_cameras(folder, place.root)
         run["history"] = file_cache.of(place.metrics, _history) if place.metrics.is_file() else []
         run["preview"] = max(place.previews.glob("*.png"), default=None)
     state.takes = _named(_Take, paths.takes, contract.TAKE_FILE, state.damaged["take"])
@@ -85,7 +85,7 @@ def stamp(folder: Path) -> tuple[float, ...]:
     anew = [p for place in places if place.is_dir() for p in place.iterdir()]
     # On FAT and exFAT disks (memory cards, portable disks), Windows does not update a folder's time when its files
     # change.
-    files = [place / name for place in [*deep, *anew] for name in _TOLD]
+    files = [place / name for place in [*deep, *anew] for name in _REPORTED_FILES]
     files += [contract.TakeFolder(place).mattes_record for place in deep]
     return tuple(_mtime(p) for p in [*parts, *deep, *anew, *files])
 
@@ -188,7 +188,8 @@ def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
 
 
 def _listed(path: Path) -> tuple[int, str, list[str], str, int]:
-    """Values of frames.json: the number of frames, and `beside`, `read_as`, `timecode` and `shift` of `ShotState`."""
+    """Values of frames.json: the number of frames, and `relative_source`, `read_as`, `timecode` and `shift` of
+    `ShotState`."""
     listing = _read_typed(path, _Listing, contract.LONGEST_JSON)
     read_as = [contract.printable(line, 300) for line in listing["read_as"][:_MOST_SENTENCES] if isinstance(line, str)]
     return (
@@ -207,9 +208,9 @@ def _digests(path: Path) -> dict[int, str]:
     return {row["frame"]: str(row.get("digest", "")) for row in found if isinstance(row.get("frame"), int)}
 
 
-def _frame_count(take: Path, told: float) -> int:
-    """Number of frames in a take's folder. `told` is the time of take.json; it is part of the cache key, because the
-    folder's own time may not change."""
+def _frame_count(take: Path, modified: float) -> int:
+    """Number of frames in a take's folder. `modified` is the time of take.json; it is part of the cache key, because
+    the folder's own time may not change."""
     with os.scandir(take) as entries:
         return sum(1 for entry in entries if entry.name.endswith(contract.LAYERS))
 
@@ -327,22 +328,22 @@ def _read_typed(path: Path, kind: type, longest: int = contract.SHORT_JSON) -> d
     data = contract.read_json(path, longest)
     contract.check_version(data, str(path))
     try:
-        return _believed(kind, data)
+        return _validated(kind, data)
     except ValueError as error:
         raise contract.UserError(f"{path} is damaged: {str(error).lstrip('_')}.") from error
 
 
-def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
+def _validated(kind: type, data: dict[str, Any]) -> dict[str, Any]:
     names = [one.name for one in dataclasses.fields(kind) if one.name in data]
-    made: object = contract.from_dict(kind, {name: data[name] for name in names})
-    values = vars(made)
+    parsed: object = contract.from_dict(kind, {name: data[name] for name in names})
+    values = vars(parsed)
     for name, value in values.items():
         if isinstance(value, (int, float)) and not abs(value) < _LARGEST:
             raise contract.UserError(f"{kind.__name__}.{name} cannot be that large")
         if isinstance(value, str) and name not in ("source", "camera_path"):
             values[name] = contract.printable(value)
     if isinstance(values.get("result"), dict):
-        values["result"] = _believed(_Solve, values["result"])
+        values["result"] = _validated(_Solve, values["result"])
     elif "result" in values:
         del values["result"]
     return {**data, **values}
@@ -351,7 +352,7 @@ def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
 _MOST_SENTENCES = 4
 _LARGEST = 1 << 31
 """Limit of Blender's integers."""
-_TOLD = (contract.SUMMARY_FILE, contract.CHECKPOINT_FILE, contract.EXTENSION_FILE, contract.TAKE_FILE)
+_REPORTED_FILES = (contract.SUMMARY_FILE, contract.CHECKPOINT_FILE, contract.EXTENSION_FILE, contract.TAKE_FILE)
 """Files in the folders of runs and takes that the panel reports on."""
 _LONGEST_HISTORY = 1 << 24
 """Maximum bytes read of a run's metrics, enough for 100,000 measurements."""

@@ -36,11 +36,11 @@ def source_of(state: ShotState) -> str:
 
     Empty if the footage is in neither place.
     """
-    named, beside = str(state.info.get("source", "")), state.beside
+    named, relative_source = str(state.info.get("source", "")), state.relative_source
     candidates = [Path(named), state.folder.parent / re.split(r"[\\/]", named)[-1]]
-    if beside:
-        candidates.insert(1, state.folder / beside)
-    return next((os.path.normpath(p) for p in candidates if named and _there(p)), "")
+    if relative_source:
+        candidates.insert(1, state.folder / relative_source)
+    return next((os.path.normpath(p) for p in candidates if named and _exists(p)), "")
 
 
 def locate(scene: bpy.types.Scene, folder: Path) -> None:
@@ -56,7 +56,7 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
     if not state.info:
         hint = "Choose the folder that holds shot.json; its name ends with .splannequin unless it was renamed."
         raise contract.JobError(f"{folder} is no shot folder.", hint, contract.ExitCode.USAGE)
-    held, before = settings_of(scene), selection.folder_of(settings_of(scene))
+    props, before = settings_of(scene), selection.folder_of(settings_of(scene))
     entry = scene_objects.of(scene, before) if before is not None else None
     if entry is not None and scene_objects.of(scene, folder) in (None, entry):
         entry.name, entry.folder = scene_objects.name_of(folder), paths.blend_path(folder)
@@ -68,13 +68,13 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
         path = Path(paths.absolute(_get(owner, name)))
         if before is not None and before in (path, _rendered_of(path)) and not before.exists():
             _set(owner, name, paths.blend_path(folder / path.relative_to(before)))
-    held.shot_path = held.shot_seen = paths.blend_path(folder)
+    props.shot_path = props.shot_seen = paths.blend_path(folder)
     source = source_of(state)
-    if source and not (held.clip and _there(Path(paths.absolute(held.clip)))):
-        held.clip = paths.blend_path(Path(source))
+    if source and not (props.clip and _exists(Path(paths.absolute(props.clip)))):
+        props.clip = paths.blend_path(Path(source))
 
 
-def _there(path: Path) -> bool:
+def _exists(path: Path) -> bool:
     """True if footage exists: a file, a folder of images, or a pattern in an existing folder."""
     return path.exists() or (contract.is_pattern(path.name) and path.parent.is_dir())
 
@@ -82,10 +82,10 @@ def _there(path: Path) -> bool:
 def _holders() -> Iterator[tuple[Any, str]]:
     """(owner, property) of every path of ours in the file."""
     for scene in [s for s in bpy.data.scenes if not library_of(s)]:
-        held = settings_of(scene)
-        for one in [held, *held.shots]:
+        props = settings_of(scene)
+        for one in [props, *props.shots]:
             yield from ((one, name) for name in _SETTINGS)
-        yield from ((entry, "folder") for entry in held.made)
+        yield from ((entry, "folder") for entry in props.made)
     yield from _outside()
 
 
@@ -194,7 +194,9 @@ def _known(path: Path, name: str) -> bool:
     """True if the file or folder of the setting `name` exists. For a clip, its shot is sufficient."""
     try:
         if name in ("clip", "cameras_path", "st_map", "lut", "ignore_path", "people_path"):
-            return _there(path) or (name == "clip" and contract.ShotFolder(selection.beside(path)).info_path.is_file())
+            return _exists(path) or (
+                name == "clip" and contract.ShotFolder(selection.folder_of_clip(path)).info_path.is_file()
+            )
         shot = _rendered_of(path) if name == _OUTPUT else path
         return shot is not None and contract.ShotFolder(shot).info_path.is_file()
     except OSError:

@@ -114,43 +114,44 @@ def keep_camera(scene: bpy.types.Scene) -> None:
         settings_of(scene).camera_before = camera
 
 
-def give_camera_back(scene: bpy.types.Scene) -> None:
+def restore_camera(scene: bpy.types.Scene) -> None:
     """Sets the camera of a scene whose camera was removed with a shot: another shot's, or the one from before all
     shots."""
-    held = settings_of(scene)
+    props = settings_of(scene)
     if scene.camera is None:
-        others = [entry.camera for entry in held.made] + [held.camera_before]
-        scene.camera = next((c for c in others if c is not None and named(scene.objects, c.name) == c), None)
-    if not len(held.made):
-        held.camera_before = None
+        candidates = [entry.camera for entry in props.made] + [props.camera_before]
+        scene.camera = next((c for c in candidates if c is not None and named(scene.objects, c.name) == c), None)
+    if not len(props.made):
+        props.camera_before = None
 
 
 def tidy(scene: bpy.types.Scene) -> None:
     """Clears pointers to objects that the artist deleted. The pointers would keep them invisibly in the file."""
     before = settings_of(scene).camera_before
-    if before is not None and not _stands(before, [scene.objects]):
+    if before is not None and not _is_in_scene(before, [scene.objects]):
         settings_of(scene).camera_before = None
     for entry in settings_of(scene).made:
         if entry.collection is not None and entry.collection not in scene.collection.children_recursive:
             entry.collection = None
-        own = [entry.collection.objects] if entry.collection is not None else []  # short list, most of our objects
+        # A short list with most of our objects.
+        entry_objects = [entry.collection.objects] if entry.collection is not None else []
         for name in (*PARTS, "plate"):
             item = getattr(entry, name)
-            if item is not None and not _stands(item, [*own, scene.objects]):
+            if item is not None and not _is_in_scene(item, [*entry_objects, scene.objects]):
                 setattr(entry, name, None)
         for kept in (entry.splats, entry.surfaces):
             for index in reversed(range(len(kept))):
                 item = kept[index].object
-                if item is None or not _stands(item, [*own, scene.objects]):
+                if item is None or not _is_in_scene(item, [*entry_objects, scene.objects]):
                     kept.remove(index)
 
 
-def _stands(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:
-    """True if any scene has an object. Searches by name in the collections `among` first.
+def _is_in_scene(item: bpy.types.Object, collections: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:
+    """True if any scene has an object. Searches by name in the collections `collections` first.
 
     Called at every tick. `users_scene` copies the list of all objects of every scene, which may be tens of thousands.
     """
-    return any(named(objects, item.name) == item for objects in among) or bool(item.users_scene)
+    return any(named(objects, item.name) == item for objects in collections) or bool(item.users_scene)
 
 
 def remove_kept(

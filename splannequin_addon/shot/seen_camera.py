@@ -52,8 +52,8 @@ def sampled(
     scene: bpy.types.Scene | None, name: str, shot: Path, number: int, size: tuple[int, int]
 ) -> contract.CameraFrame:
     """A camera at one frame in solve units; with an empty name, the scene's active camera, as markers switch it."""
-    stands, window, graph = evaluated(scene, name, number, size)
-    view = stands.normalized().inverted()
+    matrix, window, graph = evaluated(scene, name, number, size)
+    view = matrix.normalized().inverted()
     scene = present(scene)
     return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size, graph), "blender")
 

@@ -24,19 +24,19 @@ from .shot_state import ShotState
 
 _T_STAR = "splannequin.t_star"
 """Data path of the only setting that can have keyframes."""
-_ITEMS_OWN = ("rna_type", "name", "scene_settings")
+_NOT_SETTINGS = ("rna_type", "name", "scene_settings")
 """Properties of a list item that are not settings of a shot."""
 _LOOK_SECONDS = 1.0
 _switching = False
-_beside: dict[Path, tuple[float, Path]] = {}
+_clip_folders: dict[Path, tuple[float, Path]] = {}
 """Clip -> (time of the lookup in monotonic seconds, shot folder)."""
 
 
 def names() -> list[str]:
     """Names of the settings that belong to a shot."""
-    held: Any = bpy.types.Scene.bl_rna.properties["splannequin"]
-    rna = held.fixed_type.properties["shots"].fixed_type
-    return [one.identifier for one in rna.properties if one.identifier not in _ITEMS_OWN]
+    untyped: Any = bpy.types.Scene.bl_rna.properties["splannequin"]
+    rna = untyped.fixed_type.properties["shots"].fixed_type
+    return [one.identifier for one in rna.properties if one.identifier not in _NOT_SETTINGS]
 
 
 def folder_of(one: OneShot) -> Path | None:
@@ -45,26 +45,26 @@ def folder_of(one: OneShot) -> Path | None:
         return Path(os.path.abspath(bpy.path.abspath(one.shot_path)))
     if not one.clip:
         return None
-    return beside(Path(os.path.abspath(bpy.path.abspath(one.clip))))
+    return folder_of_clip(Path(os.path.abspath(bpy.path.abspath(one.clip))))
 
 
-def beside(clip: Path) -> Path:
+def folder_of_clip(clip: Path) -> Path:
     """Cached `contract.default_shot_folder`, looked up once a second, because it is called at every redraw."""
-    found = _beside.get(clip)
+    found = _clip_folders.get(clip)
     if found is None or time.monotonic() - found[0] > _LOOK_SECONDS:
-        found = _beside[clip] = (time.monotonic(), contract.default_shot_folder(clip, source.is_of))
+        found = _clip_folders[clip] = (time.monotonic(), contract.default_shot_folder(clip, source.is_of))
     return found[1]
 
 
-def look_again() -> None:
-    """Clears the cache of `beside`, because a shot may have been imported."""
-    _beside.clear()
+def clear_cache() -> None:
+    """Clears the cache of `folder_of_clip`, because a shot may have been imported."""
+    _clip_folders.clear()
 
 
 def settings(scene: bpy.types.Scene) -> list[OneShot]:
     """Settings of all shots of a scene in list order. The scene holds the settings of the selected shot."""
-    held = settings_of(scene)
-    return [held if i == held.loaded_shot else item for i, item in enumerate(held.shots)] or [held]
+    props = settings_of(scene)
+    return [props if i == props.loaded_shot else item for i, item in enumerate(props.shots)] or [props]
 
 
 def folders(scene: bpy.types.Scene) -> list[Path | None]:
@@ -77,69 +77,69 @@ def labels(scene: bpy.types.Scene) -> list[str]:
     found = folders(scene)
     called = [scene_objects.name_of(folder) if folder is not None else "New shot" for folder in found]
     return [
-        f"{name} ({_apart(folder, [o for o, other in zip(found, called, strict=True) if other == name and o])})"
+        f"{name} ({_parent_suffix(folder, [f for f, label in zip(found, called, strict=True) if f and label == name])})"
         if folder is not None and called.count(name) > 1
         else name
         for folder, name in zip(found, called, strict=True)
     ]
 
 
-def _apart(folder: Path, among: list[Path | None]) -> str:
-    """The shortest end of a folder's parent path that differs from all others in `among`; the whole path if there is
-    none."""
-    others = [other.parent.parts for other in among if other is not None and other != folder]
+def _parent_suffix(folder: Path, candidates: list[Path | None]) -> str:
+    """The shortest end of a folder's parent path that differs from all others in `candidates`; the whole path if there
+    is none."""
+    parents = [path.parent.parts for path in candidates if path is not None and path != folder]
     parts = folder.parent.parts
     for count in range(1, len(parts)):
-        if all(other[-count:] != parts[-count:] for other in others):
+        if all(parent[-count:] != parts[-count:] for parent in parents):
             return "/".join(parts[-count:])
     return str(folder.parent)
 
 
 def add(scene: bpy.types.Scene) -> None:
     """Appends a shot with default settings and selects it."""
-    held = settings_of(scene)
-    if not len(held.shots):
-        _copy(held, held.shots.add())
-        held.loaded_shot = 0
-    held.shots.add()
-    held.active_shot = len(held.shots) - 1  # the update callback calls `choose`
-    choose(scene, held.active_shot)
+    props = settings_of(scene)
+    if not len(props.shots):
+        _copy(props, props.shots.add())
+        props.loaded_shot = 0
+    props.shots.add()
+    props.active_shot = len(props.shots) - 1  # the update callback calls `choose`
+    choose(scene, props.active_shot)
 
 
 def choose(scene: bpy.types.Scene, index: int) -> None:
     """Selects a shot: its settings replace the scene's, and its camera, if loaded, becomes the active camera."""
-    held = settings_of(scene)
-    if not len(held.shots):
+    props = settings_of(scene)
+    if not len(props.shots):
         return
-    index, before = min(max(index, 0), len(held.shots) - 1), held.loaded_shot
+    index, before = min(max(index, 0), len(props.shots) - 1), props.loaded_shot
     if index != before:
-        _copy(held, held.shots[before])
-        held.shots[before].scene_settings = scene_setup.kept(scene)
-        _copy(held.shots[index], held)
-        held.loaded_shot = index
-        scene_setup.put_back(scene, held.shots[index].scene_settings)
+        _copy(props, props.shots[before])
+        props.shots[before].scene_settings = scene_setup.kept(scene)
+        _copy(props.shots[index], props)
+        props.loaded_shot = index
+        scene_setup.put_back(scene, props.shots[index].scene_settings)
         _rename(scene, {_T_STAR: _path(before), _path(index): _T_STAR})
-        folder = folder_of(held)
+        folder = folder_of(props)
         camera = scene_objects.part(scene, folder, "camera") if folder is not None else None
         if camera is not None:
             scene.camera = camera
-    if held.active_shot != index:
-        held.active_shot = index
+    if props.active_shot != index:
+        props.active_shot = index
 
 
 def remove(scene: bpy.types.Scene, index: int) -> None:
     """Removes a shot and its t* keyframes from the list and selects a neighbour. Requires two or more shots."""
-    held = settings_of(scene)
-    if index == held.loaded_shot:
-        choose(scene, index + 1 if index + 1 < len(held.shots) else index - 1)
-    chosen = held.loaded_shot
+    props = settings_of(scene)
+    if index == props.loaded_shot:
+        choose(scene, index + 1 if index + 1 < len(props.shots) else index - 1)
+    chosen = props.loaded_shot
     compat_animation.remove_fcurves(scene, _path(index))
-    _rename(scene, {_path(i): _path(i - 1) for i in range(index + 1, len(held.shots))})
-    held.shots.remove(index)
-    held.loaded_shot = held.active_shot = chosen - 1 if chosen > index else chosen
-    if len(held.shots) == 1:
-        held.shots.clear()
-        held.loaded_shot = held.active_shot = 0
+    _rename(scene, {_path(i): _path(i - 1) for i in range(index + 1, len(props.shots))})
+    props.shots.remove(index)
+    props.loaded_shot = props.active_shot = chosen - 1 if chosen > index else chosen
+    if len(props.shots) == 1:
+        props.shots.clear()
+        props.loaded_shot = props.active_shot = 0
 
 
 def _path(index: int) -> str:
@@ -151,16 +151,16 @@ def is_switching() -> bool:
     return _switching
 
 
-def _copy(one: OneShot, other: OneShot) -> None:
+def _copy(origin: OneShot, target: OneShot) -> None:
     """Copies the settings of a shot. Unset properties stay unset."""
     global _switching
     _switching = True
     try:
         for name in names():
-            if one.is_property_set(name):
-                setattr(other, name, getattr(one, name))
+            if origin.is_property_set(name):
+                setattr(target, name, getattr(origin, name))
             else:
-                other.property_unset(name)
+                target.property_unset(name)
     finally:
         _switching = False
 
@@ -198,7 +198,7 @@ def missing(scene: bpy.types.Scene, state: ShotState | None) -> bool:
 
 def see(scene: bpy.types.Scene, state: ShotState | None) -> None:
     """Records that the scene's shot exists, so that `missing` can detect its loss."""
-    folder, held = folder_of(settings_of(scene)), settings_of(scene)
+    folder, props = folder_of(settings_of(scene)), settings_of(scene)
     is_shot = folder is not None and state is not None and state.frames and state.folder == folder
-    if folder is not None and is_shot and paths.absolute(held.shot_seen) != str(folder):
-        held.shot_seen = paths.blend_path(folder)
+    if folder is not None and is_shot and paths.absolute(props.shot_seen) != str(folder):
+        props.shot_seen = paths.blend_path(folder)

@@ -21,7 +21,7 @@ class ShotState:
     """Number of imported frames, 0 before the import."""
     read_as: list[str] = field(default_factory=list[str])
     """Sentences about how the footage was read; empty for a shot of an earlier version."""
-    beside: str = ""
+    relative_source: str = ""
     """Path of the footage relative to the shot folder at the time of the import; empty if unknown."""
     shift: int = 0
     """Frame number in the shot minus frame number in the footage."""
@@ -33,10 +33,10 @@ class ShotState:
     """True if the search for motion has not ended."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     """Trained runs: name -> summary.json, with added `history`, `preview`, `extension`, `anew` (see `checkpoints`),
-    `depth_source` and `other_cameras`."""
+    `depth_source` and `has_new_cameras`."""
     unfinished: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     """Paused or running runs with a checkpoint and no summary: name -> `checkpoints.paused`, with added `history`,
-    `preview`, `anew` and `other_cameras`."""
+    `preview`, `anew` and `has_new_cameras`."""
     takes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     """Frozen takes: name -> take.json, with added `frame_count` and `mattes`."""
     damaged: dict[str, dict[str, str]] = field(default_factory=lambda: {"run": {}, "take": {}})

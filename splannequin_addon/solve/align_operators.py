@@ -74,7 +74,7 @@ class _Aligns(OperatorBase):
     """Base class of the three operators: takes clicks or selected objects, then changes the root."""
 
     count = 0
-    asked = ""
+    prompt = ""
     if TYPE_CHECKING:
         places: list[float]
         selected: bool
@@ -146,7 +146,7 @@ class _Aligns(OperatorBase):
             self.report({"ERROR"}, message)
             return {"CANCELLED"}
         stop()
-        _picking = self._mine = Picking(shot, xyz, self.count)
+        _picking = self._active = Picking(shot, xyz, self.count)
         _picking.handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
         context.window_manager.modal_handler_add(self)
         self._tell(context)
@@ -155,9 +155,9 @@ class _Aligns(OperatorBase):
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Handles events: a click selects a point, Backspace removes the last one, Esc or the right button cancels."""
         picked = _picking
-        root = cameras.find(scene_in(context), self._mine.shot, "EMPTY")
-        if picked is None or picked is not self._mine or root is None:  # superseded, or the shot was removed
-            if picked is self._mine:
+        root = cameras.find(scene_in(context), self._active.shot, "EMPTY")
+        if picked is None or picked is not self._active or root is None:  # superseded, or the shot was removed
+            if picked is self._active:
                 self.cancel(context)
             return {"CANCELLED"}
         pressed = event.value in {"PRESS", "DOUBLE_CLICK"}
@@ -204,7 +204,7 @@ class _Aligns(OperatorBase):
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Ends the clicking. Blender also calls this when another file is opened."""
-        if _picking is self._mine:
+        if _picking is self._active:
             stop()
         if context.workspace is not None:
             context.workspace.status_text_set(None)
@@ -214,7 +214,7 @@ class _Aligns(OperatorBase):
         if _picking is None:
             return
         done = f"{len(_picking.picked)} of {_picking.wanted}"
-        context.workspace.status_text_set(f"{self.asked}: {done}.  Backspace: one back.  Esc: cancel")
+        context.workspace.status_text_set(f"{self.prompt}: {done}.  Backspace: one back.  Esc: cancel")
         _redraw(context.window)
 
 
@@ -242,7 +242,7 @@ class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
     bl_label = "Floor from Three Points"
     bl_options = {"REGISTER", "UNDO"}
     count = 3
-    asked = "Click three points of the floor"
+    prompt = "Click three points of the floor"
 
     places = _places_property(3)
     selected = _SELECTED
@@ -259,7 +259,7 @@ class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
     bl_label = "Set Origin"
     bl_options = {"REGISTER", "UNDO"}
     count = 1
-    asked = "Click the point that is to be the origin"
+    prompt = "Click the point that is to be the origin"
 
     places = _places_property(1)
     selected = _SELECTED
@@ -276,7 +276,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
     bl_label = "Set Scale"
     bl_options = {"REGISTER", "UNDO"}
     count = 2
-    asked = "Click two points whose distance you know"
+    prompt = "Click two points whose distance you know"
 
     places = _places_property(2)
     selected = _SELECTED
@@ -312,12 +312,12 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
     def ready(self, context: bpy.types.Context) -> Outcome:
         """Asks for the distance, starting with the current one."""
         try:
-            one, other = self._places(context, _shot_of(scene_in(context)))
+            first, second = self._places(context, _shot_of(scene_in(context)))
         except contract.JobError as error:
             self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
             return {"CANCELLED"}
-        self.places = np.concatenate([one, other]).tolist()
-        self.distance = float(np.linalg.norm(other - one))
+        self.places = np.concatenate([first, second]).tolist()
+        self.distance = float(np.linalg.norm(second - first))
         return context.window_manager.invoke_props_dialog(self)
 
 

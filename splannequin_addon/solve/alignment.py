@@ -30,13 +30,13 @@ def middle(values: Floats) -> NDArray[np.float64]:
     return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
 
 
-def turn(one: Floats, other: Floats) -> NDArray[np.float64]:
-    """The shortest rotation [3, 3] from the direction of `one` to that of `other`, both [3]."""
-    one, other = unit(one), unit(other)
-    axis = np.asarray(np.cross(one, other), dtype=np.float64)
-    cosine = float((one * other).sum())
+def turn(start: Floats, end: Floats) -> NDArray[np.float64]:
+    """The shortest rotation [3, 3] from the direction of `start` to that of `end`, both [3]."""
+    start, end = unit(start), unit(end)
+    axis = np.asarray(np.cross(start, end), dtype=np.float64)
+    cosine = float((start * end).sum())
     if cosine < -1.0 + 1e-12:  # a half turn around any perpendicular axis
-        square = np.asarray(np.cross(one, np.eye(3)[np.argmin(np.abs(one))]), dtype=np.float64)
+        square = np.asarray(np.cross(start, np.eye(3)[np.argmin(np.abs(start))]), dtype=np.float64)
         about = unit(square)
         return 2.0 * np.outer(about, about) - np.eye(3)
     x, y, z = axis
@@ -56,9 +56,9 @@ def level(places: Floats, centres: Floats, ups: Floats) -> NDArray[np.float64]:
         JobError: the points are collinear.
     """
     places, centres = np.asarray(places, dtype=np.float64), np.asarray(centres, dtype=np.float64)
-    one, other = places[1] - places[0], places[2] - places[0]
-    normal = np.cross(one, other)
-    longest = max(_length(one), _length(other), _length(other - one))
+    first, second = places[1] - places[0], places[2] - places[0]
+    normal = np.cross(first, second)
+    longest = max(_length(first), _length(second), _length(second - first))
     if _length(normal) <= FLATTEST * longest * longest:
         raise JobError("The three points lie on one line.", "Choose three that span the floor.", ExitCode.USAGE)
     normal = unit(normal)

@@ -21,12 +21,12 @@ def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
     selection.see(scene, state)
     is_new = cameras.find(scene, shot, "EMPTY") is None
     entry, size = scene_objects.of(scene, shot), scene_objects.depth_scale(scene, shot)
-    is_other = not is_new and entry is not None and entry.world != inventory.solve_world(shot)
+    has_new_world = not is_new and entry is not None and entry.world != inventory.solve_world(shot)
     with rollback.scene_of(scene):
         motion_overlay.hide(scene, shot)  # it shows the previous mattes
         camera = cameras.build(scene, shot)
-        notes = scale.guess_scale(scene, shot, is_new or is_other)
-        if is_other and abs(scene_objects.depth_scale(scene, shot) / size - 1.0) > 1e-6:
+        notes = scale.guess_scale(scene, shot, is_new or has_new_world)
+        if has_new_world and abs(scene_objects.depth_scale(scene, shot) / size - 1.0) > 1e-6:
             notes += [note for step in steps.STEPS.values() for note in step.scaled(scene, shot)]
         changes = arrival.fit(scene, state, force_k=True)
     plate.remove(scene, shot)

@@ -85,9 +85,9 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
         ) from error
 
 
-def written(asked: children.Question, file: Path, shot: Path) -> Path:
+def written(question: children.Question, file: Path, shot: Path) -> Path:
     """The transforms.json from the second Blender. Raises JobError with that Blender's message if it failed."""
-    asked.answer(f"Blender could not read {file.name}: {{}}", "Import the file, and choose Scene Camera.")
+    question.answer(f"Blender could not read {file.name}: {{}}", "Import the file, and choose Scene Camera.")
     return contract.ShotFolder(shot).tracking
 
 
@@ -165,12 +165,12 @@ def read(scene: bpy.types.Scene, file: Path, size: tuple[int, int]) -> dict[str,
         message = f"{kinds} of {file.name} is orthographic or a panorama."
     else:
         message = f"No camera of {file.name} moves."
-    raise contract.JobError(message, camera_samples.ANOTHER, contract.ExitCode.SOLVE)
+    raise contract.JobError(message, camera_samples.MOVING_CAMERA_HINT, contract.ExitCode.SOLVE)
 
 
 def _sample(scene: bpy.types.Scene, name: str, number: int, size: tuple[int, int]) -> camera_samples.Sample:
     """A camera of the file at a frame."""
-    matrix, window, _ = seen_camera.evaluated(scene, name, number, size, camera_samples.ANOTHER)
+    matrix, window, _ = seen_camera.evaluated(scene, name, number, size, camera_samples.MOVING_CAMERA_HINT)
     return camera_samples.sample_of(number, matrix, window, size)
 
 
@@ -234,9 +234,11 @@ def _import(file: Path) -> None:
         raise _refused(file, "")
 
 
-def _refused(file: Path, said: str) -> contract.JobError:
+def _refused(file: Path, message: str) -> contract.JobError:
     """The error for a file that an importer refused, with the importer's message unless it is a traceback."""
-    first = next((line for line in said.splitlines() if line.strip()), "").removeprefix("Error: ").strip().rstrip(".")
+    first = (
+        next((line for line in message.splitlines() if line.strip()), "").removeprefix("Error: ").strip().rstrip(".")
+    )
     why = (
         contract.printable(first, 200) if first and "Traceback" not in first else "it is damaged, or of another format"
     )

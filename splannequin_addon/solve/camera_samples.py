@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import bpy
     from mathutils import Matrix
 
-ANOTHER = "Choose a camera that moves as the clip's did."
+MOVING_CAMERA_HINT = "Choose a camera that moves as the clip's did."
 """Hint for a camera that cannot be the clip's."""
 _STILL = 1e-6
 """Largest change in a still camera's matrix elements, relative to its position, because Blender's matrices are
@@ -30,7 +30,7 @@ class Sample:
 
     number: int
     """Frame number."""
-    stands: np.ndarray
+    pose: np.ndarray
     """Camera-to-world, [4, 4] float64, Blender's camera axes. The axes have length 1, but may be sheared or
     mirrored."""
     K: tuple[float, ...]
@@ -59,14 +59,14 @@ def sample_of(number: int, matrix: Matrix, window: Matrix, size: tuple[int, int]
         window: perspective projection, [4, 4].
         size: width and height of the image in pixels.
     """
-    stands = np.array(matrix, dtype=np.float64)
-    stands[:3, :3] /= np.maximum(np.sqrt((stands[:3, :3] ** 2).sum(axis=0)), 1e-30)
-    return Sample(number, stands, tuple(axes.k_from_window(window, size)))
+    pose = np.array(matrix, dtype=np.float64)
+    pose[:3, :3] /= np.maximum(np.sqrt((pose[:3, :3] ** 2).sum(axis=0)), 1e-30)
+    return Sample(number, pose, tuple(axes.k_from_window(window, size)))
 
 
 def moves(samples: Sequence[Sample]) -> bool:
     """True if the camera's pose changes between the samples."""
-    poses = np.array([s.stands for s in samples])
+    poses = np.array([s.pose for s in samples])
     reach = max(1.0, float(np.abs(poses[:, :3, 3]).max()))
     return bool(np.abs(poses - poses[0]).max() > _STILL * reach)
 
@@ -87,8 +87,8 @@ def _spans(data: bpy.types.AnimData | None) -> list[tuple[float, float]]:
     if data is None:
         return []
     action: Any = data.action
-    own = [tuple(action.curve_frame_range)] if action is not None else []
-    return own + [(s.frame_start, s.frame_end) for track in data.nla_tracks for s in track.strips]
+    action_spans = [tuple(action.curve_frame_range)] if action is not None else []
+    return action_spans + [(s.frame_start, s.frame_end) for track in data.nla_tracks for s in track.strips]
 
 
 def without_ends(samples: Sequence[Sample], span: tuple[float, float] | None) -> list[Sample]:
@@ -106,9 +106,9 @@ def without_ends(samples: Sequence[Sample], span: tuple[float, float] | None) ->
     return list(samples[first : last + 1])
 
 
-def _alike(one: Sample, other: Sample) -> bool:
+def _alike(first: Sample, second: Sample) -> bool:
     """True if a camera is bitwise identical at two frames, as between frames without motion."""
-    return one.K == other.K and bool((one.stands == other.stands).all())
+    return first.K == second.K and bool((first.pose == second.pose).all())
 
 
 def transforms(
@@ -140,7 +140,7 @@ def transforms(
             "notes": [list(note) for note in notes],
         },
         "frames": [
-            {"file_path": f"{s.number}.png", "transform_matrix": s.stands.tolist(), **lens}
+            {"file_path": f"{s.number}.png", "transform_matrix": s.pose.tolist(), **lens}
             for s, lens in zip(samples, lenses, strict=True)
         ],
     }

@@ -51,11 +51,11 @@ def scene_from_solve(
     forward = -matrices[:, :3, 2].mean(axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     up = up if floor is None else np.array(floor[0], dtype=np.float64)
-    ahead = forward - up * float(forward @ up)
-    if np.linalg.norm(ahead) < 1e-6:  # looking straight up or down
-        ahead = np.cross(up, np.roll(up, 1))
-    ahead = ahead / np.linalg.norm(ahead)
-    rotation = np.stack([np.cross(ahead, up), ahead, up])  # scene x, y, z in solve coordinates
+    heading = forward - up * float(forward @ up)
+    if np.linalg.norm(heading) < 1e-6:  # looking straight up or down
+        heading = np.cross(up, np.roll(up, 1))
+    heading = heading / np.linalg.norm(heading)
+    rotation = np.stack([np.cross(heading, up), heading, up])  # scene x, y, z in solve coordinates
     seen = (points if len(points) else matrices[:, :3, 3]) @ rotation.T
     centre = alignment.middle(seen)
     centre[2] = np.sort(seen[:, 2])[len(seen) // 50] if floor is None else floor[1]
@@ -89,14 +89,14 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     with rollback.scene_of(scene):
         # Everything that can fail comes before changes to existing objects.
         world, size, plate = inventory.solve_world(shot), _extent(path), _plate(shot)
-        stands = np.eye(4) if world else scene_from_solve(path, xyz, floor)
+        pose = np.eye(4) if world else scene_from_solve(path, xyz, floor)
         mesh = _point_mesh(f"{name} points", xyz, rgb)
         kept = {n: item for n in ("camera", "points") if (item := _editable(scene, shot, n)) is not None}
-        _clear(scene, shot, but=("root", *kept))  # the root stays, with its children and transform
-        root = _root(scene, shot, stands, size)
+        _clear(scene, shot, exclude=("root", *kept))  # the root stays, with its children and transform
+        root = _root(scene, shot, pose, size)
         if present(scene_objects.of(scene, shot)).world != world:
             present(scene_objects.of(scene, shot)).world = world
-            root.matrix_world = Matrix(stands.tolist())
+            root.matrix_world = Matrix(pose.tolist())
         camera = kept.get("camera") or _new_camera(name, size)
         cloud = kept.get("points") or _new_points(name, mesh)
         _place(scene, shot, root, [item for item in (camera, cloud) if item not in kept.values()])
@@ -118,13 +118,13 @@ def _editable(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object
     return item if item is not None and not library_of(item) and not library_of(present(item.data)) else None
 
 
-def _root(scene: bpy.types.Scene, shot: Path, stands: np.ndarray, size: float) -> bpy.types.Object:
+def _root(scene: bpy.types.Scene, shot: Path, pose: np.ndarray, size: float) -> bpy.types.Object:
     """The root of a shot in its collection. Both are created if missing.
 
     Args:
         scene: the scene.
         shot: shot folder.
-        stands: transform of a new root, [4, 4].
+        pose: transform of a new root, [4, 4].
         size: display size of a new root.
     """
     name, entry = scene_objects.name_of(shot), scene_objects.new(scene, shot)
@@ -136,7 +136,7 @@ def _root(scene: bpy.types.Scene, shot: Path, stands: np.ndarray, size: float) -
     if root is None:
         root = entry.root = bpy.data.objects.new(f"{name} root", None)
         root.empty_display_type = "ARROWS"
-        root.matrix_world = Matrix(stands.tolist())
+        root.matrix_world = Matrix(pose.tolist())
         root.empty_display_size = size
         collection.objects.link(root)
     for item in (scene_objects.part(scene, shot, "camera"), scene_objects.part(scene, shot, "points")):
@@ -201,23 +201,23 @@ def remove(scene: bpy.types.Scene, shot: Path) -> bool:
     _clear(scene, shot)
     scene_objects.drop(scene, shot)
     if was and ours:
-        scene_objects.give_camera_back(scene)
+        scene_objects.restore_camera(scene)
     return True
 
 
-def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> None:
+def _clear(scene: bpy.types.Scene, shot: Path, exclude: tuple[str, ...] = ()) -> None:
     """Removes the objects of a shot, except for the named parts. With any named part, the collection also stays."""
     entry = scene_objects.of(scene, shot)
     if entry is None:
         return
     guesses.unmark(scene, shot)
-    for item in [getattr(entry, name) for name in scene_objects.PARTS if name not in but]:
+    for item in [getattr(entry, name) for name in scene_objects.PARTS if name not in exclude]:
         if item is None or (item.users_scene and scene not in item.users_scene):
             continue
         for child in [c for c in item.children if c not in [getattr(entry, name) for name in scene_objects.PARTS]]:
-            stood = child.matrix_world.copy()
+            matrix = child.matrix_world.copy()
             child.parent = None
-            child.matrix_world = stood
+            child.matrix_world = matrix
         data, images = item.data, []
         actions = [b.animation_data.action for b in (item, data) if b is not None and b.animation_data]
         if item.type == "CAMERA":
@@ -227,7 +227,7 @@ def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> Non
         bpy.data.batch_remove(unused)
         bpy.data.batch_remove([i for i in images if i.users == 0])
     collection = entry.collection
-    if but or collection is None:
+    if exclude or collection is None:
         return
     for item in [o for o in collection.objects if o.users_collection == (collection,)]:
         scene.collection.objects.link(item)

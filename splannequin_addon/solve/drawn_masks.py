@@ -49,7 +49,7 @@ def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple
     into = folder.own(folder.drawn_masks(kind))
     into.mkdir(parents=True, exist_ok=True)
     _tidy(into.parent)
-    partial = _beside(into, os.getpid())
+    partial = _temporary_folder(into, os.getpid())
     shift = _shift(folder)
     try:
         for done, number in enumerate(numbers, 1):
@@ -58,23 +58,25 @@ def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple
         for old in into.glob("*.png"):
             if old.stem.isdecimal():
                 contract.remove_file(old)
-        for made in sorted(partial.iterdir()):
-            contract.replace_file(made, into / made.name)
+        for image in sorted(partial.iterdir()):
+            contract.replace_file(image, into / image.name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return into
 
 
-def _beside(into: Path, pid: int) -> Path:
+def _temporary_folder(into: Path, pid: int) -> Path:
     """Temporary folder next to `into` for a process's images. A killed process leaves it behind; its name identifies
     the process."""
-    return into.with_name(f".{into.name}-{_here()}-{pid}-{int(contract.process_start(pid))}-{uuid.uuid4().hex[:8]}")
+    return into.with_name(
+        f".{into.name}-{_computer_digest()}-{pid}-{int(contract.process_start(pid))}-{uuid.uuid4().hex[:8]}"
+    )
 
 
-_BESIDE = re.compile(r"\.[a-z]+-([0-9a-f]{8})-([0-9]{1,10})-([0-9]{1,20})-[0-9a-f]{8}")
+_TEMPORARY_NAME = re.compile(r"\.[a-z]+-([0-9a-f]{8})-([0-9]{1,10})-([0-9]{1,20})-[0-9a-f]{8}")
 
 
-def _here() -> str:
+def _computer_digest() -> str:
     """Digest of this computer's name, for folder names."""
     return hashlib.sha256(contract.computer_name().encode()).hexdigest()[:8]
 
@@ -83,9 +85,9 @@ def _tidy(masks: Path) -> None:
     """Removes temporary folders in a shot that were left by killed Blender processes of this computer."""
     if contract.is_link(masks):
         return
-    left = [(folder, _BESIDE.fullmatch(folder.name)) for folder in masks.glob(".*")]
+    left = [(folder, _TEMPORARY_NAME.fullmatch(folder.name)) for folder in masks.glob(".*")]
     for folder, match in left:
-        if match and match[1] == _here() and not contract.runs_still(int(match[2]), float(match[3])):
+        if match and match[1] == _computer_digest() and not contract.runs_still(int(match[2]), float(match[3])):
             shutil.rmtree(folder, ignore_errors=True)  # does not follow links
 
 

@@ -93,20 +93,20 @@ def _scene_camera(scene: bpy.types.Scene) -> str:
     return str(camera.name)
 
 
-def has_file_for_blender(asked: contract.SolveParams) -> bool:
+def has_file_for_blender(requested: contract.SolveParams) -> bool:
     """True if the solve parameters name a file whose cameras Blender reads."""
-    return camera_file.is_one(asked.cameras)
+    return camera_file.is_one(requested.cameras)
 
 
-def with_file_read(scene: bpy.types.Scene, asked: contract.SolveParams, shot: Path) -> contract.SolveParams:
+def with_file_read(scene: bpy.types.Scene, requested: contract.SolveParams, shot: Path) -> contract.SolveParams:
     """Solve parameters of a command line. First writes cameras of a file that Blender reads into the shot.
 
     Raises JobError if this fails.
     """
-    if not has_file_for_blender(asked):
-        return asked
-    read = camera_file.read_now(scene, Path(os.path.abspath(asked.cameras)), _imported(shot))
-    return dataclasses.replace(asked, cameras=str(read))
+    if not has_file_for_blender(requested):
+        return requested
+    read = camera_file.read_now(scene, Path(os.path.abspath(requested.cameras)), _imported(shot))
+    return dataclasses.replace(requested, cameras=str(read))
 
 
 def reads_in_turns(scene: bpy.types.Scene) -> bool:
@@ -228,7 +228,7 @@ def begin_export(words: contract.ExportWords) -> children.Question:
     return backend.ask("export", *contract.arguments_of(words))
 
 
-def exported(asked: children.Question, folder: Path) -> str:
+def exported(question: children.Question, folder: Path) -> str:
     """Sentence about a finished export. Raises JobError with the backend's message if it failed."""
-    asked.answer("{}")
+    question.answer("{}")
     return f"Written to {folder}"

@@ -51,11 +51,11 @@ def ranges(path: contract.CameraPath, solved: set[int]) -> list[tuple[int, int]]
 def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) -> None:
     """Adds a marker at the start of each range from `ranges`. Call it after `scene_objects.new`."""
     entry = present(scene_objects.of(scene, shot))
-    others = [e for e in settings_of(scene).made if e != entry]
+    neighbours = [e for e in settings_of(scene).made if e != entry]
     put: list[list[str | int]] = []
     for first, last in unsolved:
         name = f"no solve {first}-{last}" if last > first else f"no solve {first}"
-        name += f" ({entry.name})" if others else ""
+        name += f" ({entry.name})" if neighbours else ""
         put.append([scene.timeline_markers.new(name, frame=first).name, first])
     entry.marks = json.dumps(put) if put else ""
 
@@ -74,7 +74,7 @@ def unmark(scene: bpy.types.Scene, shot: Path) -> bool:
     return is_changed
 
 
-def told(result: dict[str, Any]) -> str:
+def sentence(result: dict[str, Any]) -> str:
     """Sentence about the number of guessed cameras of a solve; empty if there are none. `result` is from solve.json."""
     guessed, total = result.get("interpolated", 0), result.get("frames", 0)
     if not guessed:

@@ -33,8 +33,8 @@ def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolvePara
 
 def drawn(scene: bpy.types.Scene) -> dict[str, bpy.types.Mask]:
     """Kind of mask -> the drawn mask that is selected for it."""
-    held = settings_of(scene)
-    chosen = {kind: getattr(held, f"{kind}_drawn") for kind in contract.MASK_KINDS if _is_drawn(scene, kind)}
+    props = settings_of(scene)
+    chosen = {kind: getattr(props, f"{kind}_drawn") for kind in contract.MASK_KINDS if _is_drawn(scene, kind)}
     return {kind: mask for kind, mask in chosen.items() if mask is not None}
 
 

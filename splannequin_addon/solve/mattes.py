@@ -117,7 +117,7 @@ def _fill(image: bpy.types.Image, pixels: np.ndarray) -> None:
 
 def find_image(shot: Path, frame: int) -> bpy.types.Image | None:
     """The image with the painted matte of a frame, or None if this file has none with pixels."""
-    return next((i for i in bpy.data.images if _is_of(i, shot, frame) and not _lost(i)), None)
+    return next((i for i in bpy.data.images if _is_of(i, shot, frame) and not _has_lost_paint(i)), None)
 
 
 def _is_of(image: bpy.types.Image, shot: Path, frame: int) -> bool:
@@ -128,7 +128,7 @@ def _is_of(image: bpy.types.Image, shot: Path, frame: int) -> bool:
     )
 
 
-def _lost(image: bpy.types.Image) -> bool:
+def _has_lost_paint(image: bpy.types.Image) -> bool:
     """True if an image has lost its paint, and is black or empty.
 
     The cause is a missing file, or an earlier version that saved the image without packing it.

@@ -47,8 +47,8 @@ def hide(scene: bpy.types.Scene, shot: Path) -> bool:
     camera_of(camera).background_images.remove(background)
     ours = _ours(camera_of(camera))
     before = list(image.get(_BEFORE, [])) if image is not None else []
-    for other, was_shown in zip(ours, before if len(before) == len(ours) else []):
-        other.show_background_image = bool(was_shown)
+    for entry, was_shown in zip(ours, before if len(before) == len(ours) else []):
+        entry.show_background_image = bool(was_shown)
     if image is not None and image.users == 0:
         bpy.data.images.remove(image)
     return True

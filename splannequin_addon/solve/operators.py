@@ -178,15 +178,15 @@ writing: set[Path] = set()
 """Shots whose ST maps are being written."""
 
 
-def follow_stmaps(shot: Path, asked: children.Question) -> None:
+def follow_stmaps(shot: Path, question: children.Question) -> None:
     """Reports on the panel when a shot's ST maps are written."""
 
     def written() -> None:
         writing.discard(shot)
-        tell(shot, lambda: stmaps.sentences(stmaps.answer(asked)))
+        tell(shot, lambda: stmaps.sentences(stmaps.answer(question)))
 
     writing.add(shot)
-    job_timer.when_answered(asked, written)
+    job_timer.when_answered(question, written)
 
 
 def tell(shot: Path, say: Callable[[], list[str]]) -> None:

@@ -80,7 +80,7 @@ def register() -> None:
     global _handler
     if not bpy.app.background:
         _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
-        children.import_beside("zipfile")  # needed by numpy to open a solve's points: 0.2 s from a cold disk
+        children.import_in_background("zipfile")  # needed by numpy to open a solve's points: 0.2 s from a cold disk
 
 
 def unregister() -> None:

@@ -39,18 +39,18 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
             camera is missing, is not a perspective camera or does not move.
     """
     uid, (numbers, size) = scene.session_uid, camera_samples.frames_of(shot)
-    _refuse_other_shape(scene, size)
+    _check_aspect_ratio(scene, size)
     samples: list[camera_samples.Sample] = []
     with seen_camera.frame_kept(uid):
         for number in numbers:
-            seen = seen_camera.evaluated(session.scene_of(uid), name, number, size, camera_samples.ANOTHER)
+            seen = seen_camera.evaluated(session.scene_of(uid), name, number, size, camera_samples.MOVING_CAMERA_HINT)
             samples.append(camera_samples.sample_of(number, seen[0], seen[1], size))
             del seen
             yield len(samples), len(numbers)
     if not camera_samples.moves(samples):
         raise contract.JobError(
             f"{name} stands still from frame {numbers[0]} to {numbers[-1]}.",
-            camera_samples.ANOTHER,
+            camera_samples.MOVING_CAMERA_HINT,
             contract.ExitCode.USAGE,
         )
     found = session.scene_of(uid)
@@ -59,7 +59,7 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
     return camera_samples.write(shot, camera_samples.transforms(covered, size, is_numbered_as_shot=True))
 
 
-def _refuse_other_shape(scene: bpy.types.Scene, size: tuple[int, int]) -> None:
+def _check_aspect_ratio(scene: bpy.types.Scene, size: tuple[int, int]) -> None:
     """Raises JobError if the render's aspect ratio differs from the clip's, because the camera's view depends on it."""
     width, height = scene_setup.render_size(scene)
     if abs((width / height) / (size[0] / size[1]) - 1.0) > _ASPECT_SLACK:

@@ -66,7 +66,7 @@ class Solve(Step):
         if not state.solve:
             return View(False, True, [], "Find where the camera was on every frame.")
         result = state.solve.get("result", state.solve)
-        lines = [line for line in (result.get("quality"), guesses.told(result)) if line]
+        lines = [line for line in (result.get("quality"), guesses.sentence(result)) if line]
         word = str(result.get("quality") or "").partition(":")[0]
         brief = word if word.lower() in contract.VERDICT_WORDS else ""
         if state.lacks_motion:
@@ -91,11 +91,11 @@ class Solve(Step):
         """The job's log, and COLMAP's log."""
         return [*super().logs(job), contract.ShotFolder(job.shot).colmap_log]
 
-    def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
+    def is_present(self, scene: bpy.types.Scene, shot: Path) -> bool:
         """True if the scene has an entry for the shot's objects."""
         return scene_objects.of(scene, shot) is not None
 
-    def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
+    def remove(self, scene: bpy.types.Scene, shot: Path, remaining: list[Path]) -> list[str]:
         """Removes camera, points and plate from the file."""
         plate.remove(scene, shot)
         return ["Camera and points were removed."] if cameras.remove(scene, shot) else []

@@ -22,9 +22,9 @@ def begin(shot: Path, width: int = 0) -> children.Question:
     return backend.ask("--json", "stmaps", str(shot.absolute()), "--width", str(width))
 
 
-def answer(asked: children.Question) -> dict[str, Any]:
+def answer(question: children.Question) -> dict[str, Any]:
     """Paths and size of the maps, and the overscan that the lens needs. Raises JobError if they were not written."""
-    return dict(json.loads(asked.answer("The ST maps were not written: {}")))
+    return dict(json.loads(question.answer("The ST maps were not written: {}")))
 
 
 def sentences(facts: dict[str, Any]) -> list[str]:

@@ -41,8 +41,8 @@ def costs(state: ShotState | None, pace: float | None = None) -> tuple[list[Cost
         same = [run for run in timed if run.get("preset") == preset]
         if preset == "final" and same and same[-1].get("device") == "cuda":
             width = same[-1]["width_px"]  # on a graphics card it may exceed the working frames' width
-        own = [run for run in same if run.get("width_px") == width]
-        nearest = own[-1:] or timed[-1:]
+        same_width = [run for run in same if run.get("width_px") == width]
+        nearest = same_width[-1:] or timed[-1:]
         seconds = None
         for run in nearest:
             seconds = steps * _per_step(run) * (width / run["width_px"]) ** 2
@@ -50,7 +50,7 @@ def costs(state: ShotState | None, pace: float | None = None) -> tuple[list[Cost
             size = contract.ShotSize(state.frames, state.size, state.size)
             expected = contract.expected_seconds("train", contract.TrainParams(preset=preset), size)
             seconds = None if expected is None else pace * expected
-        rows.append(Cost(preset, width, steps, seconds, bool(own)))
+        rows.append(Cost(preset, width, steps, seconds, bool(same_width)))
     return rows, timed[-1] if timed else None
 
 

@@ -34,10 +34,10 @@ def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Pla
     stored = finished or paused
     if stored is None:
         return Plan("train", "Train", "")
-    if _goes_on(stored, preset, depth):
+    if _can_resume_anew(stored, preset, depth):
         words = "Paused while the run was trained anew. The run is as it was until the new one is done."
         return Plan("resume", "Resume", words)
-    if stored.get("other_cameras"):
+    if stored.get("has_new_cameras"):
         return Plan(
             "anew", "Train Anew", "The camera was solved again: training begins anew and replaces this run when done. "
             "Give the run another name to keep it."
@@ -59,17 +59,17 @@ def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Pla
     return Plan("extend", "Train On", "Adds these steps to the run. It stays as it is until all are done.")
 
 
-def _goes_on(told: dict[str, Any], preset: str, depth: str) -> bool:
+def _can_resume_anew(stored: dict[str, Any], preset: str, depth: str) -> bool:
     """True if the run's repeated training has this preset, these depth maps and the shot's current cameras."""
-    anew = told.get("anew")
+    anew = stored.get("anew")
     return (
-        anew is not None and anew["preset"] == preset and not anew["other_cameras"] and _same_depth(anew, depth)
+        anew is not None and anew["preset"] == preset and not anew["has_new_cameras"] and _same_depth(anew, depth)
     )  # fmt: skip
 
 
-def _same_depth(told: dict[str, Any], depth: str) -> bool:
+def _same_depth(stored: dict[str, Any], depth: str) -> bool:
     """True if a run has these depth maps, or if none are selected."""
-    return not depth or os.path.normcase(told.get("depth_source", "")) == os.path.normcase(depth)
+    return not depth or os.path.normcase(stored.get("depth_source", "")) == os.path.normcase(depth)
 
 
 def params(
@@ -80,7 +80,7 @@ def params(
     if state is not None and kind == "resume":
         # Use the run's settings, not the panel's, so that a run started on the command line also resumes.
         stored = state.runs.get(run) or state.unfinished[run]
-        begun = stored["anew"] if _goes_on(stored, preset, depth) else stored
+        begun = stored["anew"] if _can_resume_anew(stored, preset, depth) else stored
         settings = checkpoints.params_of(begun["config"])
         return contract.TrainParams(run=run, device=device, depth=begun.get("depth_source", ""), **settings)
     extend = 0
@@ -92,12 +92,12 @@ def params(
     return contract.TrainParams(run=run, preset=preset, device=device, extend=extend, depth=chosen)
 
 
-def history(told: dict[str, Any], now: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def history(stored: dict[str, Any], now: list[tuple[float, float]]) -> list[tuple[float, float]]:
     """(seconds, dB) of a run, or of the training that will replace it: stored points, then the job's `now`."""
-    before = (told.get("anew") or told).get("history", [])
+    before = (stored.get("anew") or stored).get("history", [])
     return [point for point in before if not now or point[0] < now[0][0]] + list(now)
 
 
-def preview(told: dict[str, Any], now: str | None) -> Path | None:
+def preview(stored: dict[str, Any], now: str | None) -> Path | None:
     """Latest preview image of a run, or of the training that will replace it: the job's `now`, else a stored one."""
-    return Path(now) if now else (told.get("anew") or told).get("preview")
+    return Path(now) if now else (stored.get("anew") or stored).get("preview")

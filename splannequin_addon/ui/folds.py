@@ -21,7 +21,7 @@ _chosen: dict[tuple[int, Path | None, str], bool] = {}
 """(`session_uid` of the scene, shot folder, step) -> open state set by the artist."""
 
 
-def at_hand(scene: bpy.types.Scene) -> str:
+def current_step(scene: bpy.types.Scene) -> str:
     """Name of the step to work on: the running or last failed step, else the first unfinished one."""
     folder = selection.shot_folder(scene)
     watch = job_timer.watch_of(folder) if folder is not None else None
@@ -39,7 +39,7 @@ def is_open(scene: bpy.types.Scene, step: str) -> bool:
     """True if the panel shows a step's body: it is the step to work on, has just ended, or the artist opened it."""
     folder = selection.shot_folder(scene)
     watch = job_timer.watch_of(folder) if folder is not None else None
-    by_itself = step == at_hand(scene) or (watch is not None and watch.just_ended == step)
+    by_itself = step == current_step(scene) or (watch is not None and watch.just_ended == step)
     key = (scene.session_uid, folder, step)
     if _chosen.get(key) == by_itself:
         del _chosen[key]

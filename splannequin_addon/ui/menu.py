@@ -20,7 +20,7 @@ _GROUPS = (
     ("locate_shot", "remove_shot"),
 )
 """Names of operators in order of use. Operators that are missing here come last."""
-_ELSEWHERE = {"use_movie_clip"}
+_EXCLUDED = {"use_movie_clip"}
 """Operators that are only in the menu of the editor they need."""
 
 
@@ -33,7 +33,7 @@ def searchable() -> set[str]:
 
 def entries() -> Iterator[list[str]]:
     """Names of the operators in the menu, one list per group."""
-    left = searchable() - _ELSEWHERE
+    left = searchable() - _EXCLUDED
     for group in _GROUPS:
         yield [name for name in group if name in left]
         left -= set(group)
@@ -67,7 +67,7 @@ def _in_clip(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     layout_of(self).operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
 
 
-def _hung() -> list[tuple[Any, Callable[[bpy.types.Menu, bpy.types.Context], None]]]:
+def _menu_entries() -> list[tuple[Any, Callable[[bpy.types.Menu, bpy.types.Context], None]]]:
     """Pairs of (Blender menu, function that draws our entries in it)."""
     return [(bpy.types.TOPBAR_MT_render, _in_render), (bpy.types.CLIP_MT_clip, _in_clip)]
 
@@ -75,12 +75,12 @@ def _hung() -> list[tuple[Any, Callable[[bpy.types.Menu, bpy.types.Context], Non
 def register() -> None:
     """Registers the menu and adds it to Blender's menus."""
     bpy.utils.register_class(SPLANNEQUIN_MT_shot)
-    for menu, draw in _hung():
+    for menu, draw in _menu_entries():
         menu.append(draw)
 
 
 def unregister() -> None:
     """Undoes `register`."""
-    for menu, draw in _hung():
+    for menu, draw in _menu_entries():
         menu.remove(draw)
     bpy.utils.unregister_class(SPLANNEQUIN_MT_shot)

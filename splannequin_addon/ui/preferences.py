@@ -72,7 +72,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         layout.prop(self, "device")
         layout.prop(self, "backend_python")
 
-    def _draw_setup(self, there: bool) -> None:
+    def _draw_setup(self, has_backend: bool) -> None:
         box = layout_of(self).box()
         row = box.row()
         row.enabled = not busy()
@@ -92,14 +92,14 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
             if ours:
                 row.operator("splannequin.remove_backend", icon="TRASH")
         if _setup is not None:
-            for line in _setup.said if _setup.running else []:
+            for line in _setup.output if _setup.running else []:
                 self._say(box, line)
             if _setup.failure:
                 column = box.column(align=True)
                 column.alert = True
                 self._say(column, _setup.failure, "ERROR")
                 self._say(column, "Repair goes on where it stopped.", "BLANK1")
-        elif not there:
+        elif not has_backend:
             self._say(box, f"Makes a Python environment of its own, {environment.SIZE}.", "INFO")
             self._say(box, f"It installs {environment.LICENCES}.", "BLANK1")
         if _is_offline():
@@ -196,7 +196,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
             return {"CANCELLED"}
         _findings.clear()
         if not bpy.app.background:
-            job_timer.meanwhile(_follow_setup)
+            job_timer.call_until_false(_follow_setup)
             return {"FINISHED"}
         if _setup.process is not None:
             _setup.process.wait()
@@ -239,12 +239,12 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
             return {"CANCELLED"}
         if bpy.app.background:
             question.wait(120.0)
-            _take_in(question)
+            _show_findings(question)
             for line in _findings:
                 self.report({"INFO"}, tr(line))
             return {"FINISHED"}
         _checks.append(question)
-        job_timer.when_answered(question, lambda: _take_in(question))
+        job_timer.when_answered(question, lambda: _show_findings(question))
         return {"FINISHED"}
 
 
@@ -271,8 +271,8 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
                 return {"CANCELLED"}
         try:
             was_removed = environment.remove(backend.folder(), wait=bpy.app.background)
-        except environment.AtWork as other:
-            self.report({"ERROR"}, tr(_at_work(other.pid)))
+        except environment.AtWork as error:
+            self.report({"ERROR"}, tr(_at_work(error.pid)))
             return {"CANCELLED"}
         except (OSError, ValueError) as error:
             self.report({"ERROR"}, tr(f"The environment stays: {error}"))
@@ -293,12 +293,12 @@ _checks: list[children.Question] = []
 """Doctor questions without an answer."""
 
 
-def _take_in(asked: children.Question) -> None:
+def _show_findings(question: children.Question) -> None:
     """Shows the result of a doctor question."""
-    if asked in _checks:
-        _checks.remove(asked)
+    if question in _checks:
+        _checks.remove(question)
     try:
-        _findings[:] = environment.findings(backend.diagnosis(asked))
+        _findings[:] = environment.findings(backend.diagnosis(question))
     except (contract.JobError, ValueError, KeyError) as error:
         _findings[:] = [f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()]
     _redraw()

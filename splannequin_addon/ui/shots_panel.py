@@ -159,13 +159,13 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
         if len(settings_of(scene_in(context)).shots) > 1:
             self._list(context, layout)
         self._all_steps(context, layout)
-        at_hand = folds.at_hand(scene_in(context))
+        current_step = folds.current_step(scene_in(context))
         for name, step in steps.STEPS.items():
-            step.panel.draw(context, layout, name == at_hand)
+            step.panel.draw(context, layout, name == current_step)
 
     def _all_steps(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Draws the button that runs all remaining steps up to the freeze, or their progress."""
-        folder, ahead = selection.shot_folder(scene_in(context)), all_steps.missing(scene_in(context))
+        folder, remaining = selection.shot_folder(scene_in(context)), all_steps.missing(scene_in(context))
         if folder is None:
             return
         now = all_steps.progress(folder)
@@ -175,10 +175,10 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
             row.progress(factor=share, type="BAR", text=tr(f"All steps {100 * share:.0f} %"))
             row.operator("splannequin.cancel", text="Cancel", icon=icons.of("splannequin.cancel")).step = ""
             wrap(layout, context, f"about {contract.duration(left)} left", "INFO")
-        elif len(ahead) > 1 and job_timer.watch_of(folder).running() is None:
+        elif len(remaining) > 1 and job_timer.watch_of(folder).running() is None:
             row = layout.row()
             row.scale_y = 1.4
-            text = "Train and Freeze" if "solve" not in ahead else "Solve, Train and Freeze"
+            text = "Train and Freeze" if "solve" not in remaining else "Solve, Train and Freeze"
             row.operator("splannequin.all_steps", text=text, icon=icons.of("splannequin.all_steps"))
 
     def _list(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:

@@ -28,7 +28,7 @@ class StepPanel:
 
     title = ""
     """Title in the step's header."""
-    is_at_hand = False
+    is_current = False
     """True while this step is drawn as the one to work on."""
     step = ""
     operator = ""
@@ -50,9 +50,9 @@ class StepPanel:
             )
         return steps.STEPS[self.step].view(scene_in(context), watch.state if watch else None)
 
-    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_at_hand: bool) -> None:
+    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_current: bool) -> None:
         """Draws the step's header, and its body if open. The next action appears only for the step to work on."""
-        self.is_at_hand = is_at_hand
+        self.is_current = is_current
         parts = layout.panel_prop(settings_of(scene_in(context)), f"is_{self.step}_open")
         header, body = cast("tuple[bpy.types.UILayout, bpy.types.UILayout | None]", parts)  # None while it is collapsed
         view = self._view(context)
@@ -99,7 +99,7 @@ class StepPanel:
         else:
             self._button(context, layout, view, running)
             self._outcome(context, layout, watch, view.state)
-            if running is None and view.advice and self.is_at_hand:
+            if running is None and view.advice and self.is_current:
                 wrap(layout, context, view.advice, "INFO")
         body = sub_panel(layout, f"{self.folds}_more", "Advanced")
         if body is not None:
@@ -135,7 +135,7 @@ class StepPanel:
         work = watch.work
         if work is not None:
             row = layout.split(factor=0.7, align=True) if work.turns is not None else layout
-            self._own_progress(row, context, work.progress)
+            self._work_progress(row, context, work.progress)
             if work.turns is not None:
                 row.operator("splannequin.cancel", text="Cancel", icon=icons.of("splannequin.cancel")).step = self.step
             return
@@ -153,7 +153,7 @@ class StepPanel:
         if started_elsewhere(job):
             wrap(layout, context, f"Started from {job.blend}.", "FILE_BLEND")
 
-    def _own_progress(
+    def _work_progress(
         self, layout: bpy.types.UILayout, context: bpy.types.Context, now: job_timer.Progress | None
     ) -> None:
         """Draws the progress of work done in Blender."""
@@ -165,9 +165,9 @@ class StepPanel:
             wrap(layout, context, now.hint, "INFO")
 
     def _outcome(
-        self, context: bpy.types.Context, layout: bpy.types.UILayout, watch: job_timer.Watch | None, said: list[str]
+        self, context: bpy.types.Context, layout: bpy.types.UILayout, watch: job_timer.Watch | None, shown: list[str]
     ) -> None:
-        """Draws the error or the changes of the last job, without warnings in `said`."""
+        """Draws the error or the changes of the last job, without warnings in `shown`."""
         if watch is None:
             return
         job = watch.jobs.get(self.step)
@@ -185,7 +185,7 @@ class StepPanel:
             return
         if job is not None and job.state == "cancelled" and not self._paused(context):
             wrap(layout, context, "Cancelled. Finished work is kept: start it again to go on.", "CANCEL")
-        for line in unsaid(job.warnings if job is not None else [], said):
+        for line in new_warnings(job.warnings if job is not None else [], shown):
             wrap(layout, context, line, "ERROR")
         for note in watch.notes.get(self.step, []):
             wrap(layout, context, note, "DOT")
@@ -200,9 +200,9 @@ def started_elsewhere(job: jobs.Job) -> bool:
     return job.blend not in ("", os.path.basename(bpy.data.filepath))
 
 
-def unsaid(warnings: list[tuple[str, str]], said: list[str]) -> list[str]:
+def new_warnings(warnings: list[tuple[str, str]], shown: list[str]) -> list[str]:
     """A job's warnings as lines, without those that the step's state already shows."""
-    return [f"{message} {hint}".strip() for message, hint in warnings if message not in said]
+    return [f"{message} {hint}".strip() for message, hint in warnings if message not in shown]
 
 
 def sub_panel(layout: bpy.types.UILayout, name: str, label: str, folded: bool = True) -> Any | None:

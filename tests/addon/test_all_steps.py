@@ -34,9 +34,9 @@ def ended_job(addon, contract, watch, step, state="done"):
     watch.jobs[step] = job
 
 
-def begun(chain, watch, ahead, step="solve"):
-    """Register a chain of steps with `step` running and `ahead` still to run."""
-    found = chain.Chain(list(ahead), chain.contract.TotalProgress({}), step)
+def begun(chain, watch, remaining, step="solve"):
+    """Register a chain of steps with `step` running and `remaining` still to run."""
+    found = chain.Chain(list(remaining), chain.contract.TotalProgress({}), step)
     chain._chains[watch.shot] = found
     return found
 
@@ -69,7 +69,7 @@ def test_a_step_that_fails_is_the_last_one(addon, scene, chain, solved, monkeypa
 @pytest.mark.parametrize("state", ["failed", "cancelled"])
 def test_after_a_job_that_did_not_end_well_nothing_is_begun(addon, contract, chain, watch, monkeypatch, state):
     pressed = []
-    monkeypatch.setattr(chain, "_begin_next", lambda found, scene: pressed.append(found.ahead.pop(0)))
+    monkeypatch.setattr(chain, "_begin_next", lambda found, scene: pressed.append(found.remaining.pop(0)))
     found = begun(chain, watch, ["train", "freeze"])
     ended_job(addon, contract, watch, "solve", state)
     assert chain._turn(watch.shot, found) is False and pressed == [] and chain.progress(watch.shot) is None
@@ -79,7 +79,7 @@ def test_the_next_step_begins_when_the_one_before_is_done_and_its_shot_is_chosen
     addon, contract, scene, chain, watch, monkeypatch
 ):
     pressed = []
-    monkeypatch.setattr(chain, "_begin_next", lambda found, scene: pressed.append(found.ahead.pop(0)))
+    monkeypatch.setattr(chain, "_begin_next", lambda found, scene: pressed.append(found.remaining.pop(0)))
     found = begun(chain, watch, ["train"])
     ended_job(addon, contract, watch, "solve", "running")
     assert chain._turn(watch.shot, found) is True and pressed == []

@@ -77,7 +77,7 @@ def test_a_camera_comes_back_from_a_file(addon, filmed, shot, tmp_path, ending):
     assert told["splannequin"] == {"world": "scene", "is_numbered_as_shot": False, "notes": []}
     assert [f["file_path"] for f in told["frames"]] == ["5.png", "6.png", "7.png"]
     for found, wanted in zip(told["frames"], seen(addon, filmed, camera), strict=True):
-        np.testing.assert_allclose(found["transform_matrix"], wanted.stands, atol=2e-5)
+        np.testing.assert_allclose(found["transform_matrix"], wanted.pose, atol=2e-5)
         np.testing.assert_allclose([told[n] for n in ("fl_x", "fl_y", "cx", "cy")], wanted.K, atol=2e-5)
 
 

@@ -124,7 +124,7 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
 def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, shot):
     bake = addon("bake.insertion")
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
-    assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 1, "the artist's tree shows no plate of ours"
+    assert len(list(bake.prefetch(scene, shot, "freeze"))) == 1, "the artist's tree shows no plate of ours"
     assert set(bpy.data.node_groups.keys()) == groups
     bake.insert(scene, shot, "freeze")
     assert len(bpy.data.images) == len(images) + 1 + (not addon("compat").HAS_TEXTURE_NODE)
@@ -136,7 +136,7 @@ def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, s
     bake, plate = addon("bake.insertion"), shot / "frames" / "000005.png"
     for value in (40, 200):  # stands for a first bake that ended before insertion
         pictures.write(plate, np.full((12, 16, 3), value, np.uint8))
-        assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 2
+        assert len(list(bake.prefetch(scene, shot, "freeze"))) == 2
     image = next(i for i in bpy.data.images if i.filepath.endswith(".png"))
     assert round(255 * image.pixels[0]) == 200
     bake.insert(scene, shot, "freeze")

@@ -31,7 +31,7 @@ def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(
     folder = tmp_path / "bäckend"
     setup = environment.start(folder, sys.executable, root)
     run_out(environment, setup)
-    assert "failed at installing packages" in setup.failure, setup.said
+    assert "failed at installing packages" in setup.failure, setup.output
     assert str(folder) in setup.failure
     made = (folder / ".venv" / "pyvenv.cfg").stat().st_mtime
     again = environment.start(folder, sys.executable, root)

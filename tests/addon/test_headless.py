@@ -260,7 +260,7 @@ def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tm
     monkeypatch.setattr(addon("process.backend"), "device", lambda: "cpu")  # stands for a choice in the preferences
 
     def asked(*words):
-        return headless.asked(headless.parser().parse_args([str(w) for w in words]))
+        return headless.requested_params(headless.parser().parse_args([str(w) for w in words]))
 
     train = asked("train", tmp_path, "--method", "mlp", "--host", "mlp", "--host-config", "reference",
                   "--detector", "weight")["train"]  # fmt: skip

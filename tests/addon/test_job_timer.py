@@ -83,11 +83,11 @@ def test_a_shot_that_cannot_be_read_for_a_moment_is_read_again(contract, supervi
 
 def test_one_that_breaks_does_not_end_the_timer_for_the_others(supervisor, capfd):
     calls = []
-    supervisor.meanwhile(lambda: 1 / 0)
-    supervisor.meanwhile(lambda: len(calls) < 2 and not calls.append(len(calls)))
+    supervisor.call_until_false(lambda: 1 / 0)
+    supervisor.call_until_false(lambda: len(calls) < 2 and not calls.append(len(calls)))
     for _ in range(4):
         supervisor.tick()
-    assert calls == [0, 1] and not supervisor._meanwhile
+    assert calls == [0, 1] and not supervisor._callbacks
     assert capfd.readouterr().err.count("ZeroDivisionError") == 1
 
 
@@ -265,7 +265,7 @@ def test_a_render_is_followed_by_its_handlers(addon, supervisor, watch, shot, sm
     assert seen[1] == ("bake", "Rendering, frame 2 of 3", True)
     supervisor.tick()
     assert watch.running() is None and watch.notes["bake"][0] == "3 of 3 frames rendered."
-    assert scene.render.filepath.endswith("f_####") and not supervisor._meanwhile
+    assert scene.render.filepath.endswith("f_####") and not supervisor._callbacks
     assert len(list(Path(bpy.path.abspath(scene.render.filepath)).parent.iterdir())) == 3
 
 
@@ -299,7 +299,7 @@ def test_a_render_that_tells_no_end_is_over(addon, supervisor, watch, shot, smal
     supervisor.tick()
     assert watch.running() == "bake", "the job of a render may be about to begin"
     supervisor.tick()
-    assert watch.running() is None and not supervisor._meanwhile
+    assert watch.running() is None and not supervisor._callbacks
     assert "wrote no picture for frame 1" in watch.failures["bake"][0]
     assert scene.render.filepath.endswith("f_####")
 

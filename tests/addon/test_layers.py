@@ -207,9 +207,9 @@ def test_pictures_read_ahead_for_a_warp_are_those_that_come_in(addon, scene, det
     bake = addon("bake.insertion")
     addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     count = len(bpy.data.images)
-    assert len(list(bake.read_ahead(scene, detailed, "detail"))) == 2
+    assert len(list(bake.prefetch(scene, detailed, "detail"))) == 2
     bake.insert(scene, detailed, "detail")
-    assert len(bpy.data.images) == count and not addon("scene.sequences")._ahead
+    assert len(bpy.data.images) == count and not addon("scene.sequences")._prefetched
 
 
 @pytest.mark.parametrize("show", [0.0, 0.5, 1.0])

@@ -104,7 +104,10 @@ def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_a
 def test_what_a_killed_blender_left_of_a_mask_is_removed_by_the_next_one_and_a_living_ones_stays(addon, shot, drawn):
     into, masks = shot / "masks" / "people", addon("solve.drawn_masks")
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
-        half, ours = masks._beside(into, other.pid), masks._beside(into.with_name("ignore"), os.getpid())
+        half, ours = (
+            masks._temporary_folder(into, other.pid),
+            masks._temporary_folder(into.with_name("ignore"), os.getpid()),
+        )
         kept = [ours, into.with_name(".people"), into.with_name(".people-1")]
         for folder in (half, *kept):
             folder.mkdir(parents=True)

@@ -141,9 +141,9 @@ def test_bakes_replace_each_other_and_leave_nothing(addon, scene, footage):
 
 def test_what_is_read_ahead_is_the_footage(addon, scene, footage):
     bake, shot = addon("bake.insertion"), footage()
-    assert len(list(bake.read_ahead(scene, shot, "detail"))) == 2
+    assert len(list(bake.prefetch(scene, shot, "detail"))) == 2
     bake.insert(scene, shot, "detail")
-    assert not addon("scene.sequences")._ahead, "it is taken as it was read"
+    assert not addon("scene.sequences")._prefetched, "it is taken as it was read"
     assert [i.name for i in bpy.data.images if i.name.startswith("Plate")] == ["Plate 000005"]
 
 
@@ -152,11 +152,11 @@ def test_the_map_of_the_lens_is_read_ahead_and_again_if_it_has_changed(addon, sc
     bake, shot = addon("bake.insertion"), footage(map="stmap/undistort.exr")
     for frame in (5, 6):
         st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(frame))
-        assert len(list(bake.read_ahead(scene, shot, "detail"))) == 3
+        assert len(list(bake.prefetch(scene, shot, "detail"))) == 3
     read = next(image for image in bpy.data.images if image.name.startswith("Plate"))
     assert read.alpha_mode == "NONE", "to be set while it is inserted it would be read once more"
     bake.insert(scene, shot, "detail")
-    assert not addon("scene.sequences")._ahead, "they are taken as they were read"
+    assert not addon("scene.sequences")._prefetched, "they are taken as they were read"
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
     found, expected = render(scene, tmp_path, 6), made.moved(made.plate(6), 6)
     assert float((np.abs(found - expected) / np.maximum(np.abs(expected), 0.05)).max()) < 2e-3

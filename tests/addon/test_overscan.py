@@ -216,7 +216,7 @@ def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_s
         if not operators.writing:
             break
         time.sleep(0.02)
-    assert not operators.writing and not supervisor._meanwhile
+    assert not operators.writing and not supervisor._callbacks
     assert "stmap_redistort.exr" in watch.notes["solve"][0]
     assert bpy.ops.splannequin.write_stmaps.poll()
 

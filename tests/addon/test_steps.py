@@ -300,7 +300,7 @@ def test_two_clips_that_differ_in_their_ending_have_a_shot_each(addon, a_few, cl
         assert imported(addon, a_few, clip, tmp_path / name) == folder, "the same clip again"
     assert not addon("shot.selection").missing(a_few, addon("shot.inventory").read(second))
     shutil.rmtree(first)
-    addon("shot.selection").look_again()
+    addon("shot.selection").clear_cache()
     assert addon("shot.selection").shot_folder(a_few) == second, "its own shot, though the shorter name is free"
     (tmp_path / "a").mkdir()
     a_few.splannequin.clip = str(tmp_path / "a")

@@ -52,10 +52,10 @@ def test_a_damaged_verdict_is_left_out(addon, with_shot, shot, damaged):
 
 
 def test_what_the_verdict_tells_is_not_told_twice(addon):
-    unsaid = addon("ui.step_panel").unsaid
+    new_warnings = addon("ui.step_panel").new_warnings
     warnings = [("Poor. It does not hold.", "Solve again."), ("Something else.", "")]
-    assert unsaid(warnings, ["Run main", "Poor. It does not hold."]) == ["Something else."]
-    assert unsaid(warnings, []) == ["Poor. It does not hold. Solve again.", "Something else."]
+    assert new_warnings(warnings, ["Run main", "Poor. It does not hold."]) == ["Something else."]
+    assert new_warnings(warnings, []) == ["Poor. It does not hold. Solve again.", "Something else."]
 
 
 def test_verdicts_are_told_in_german(addon):

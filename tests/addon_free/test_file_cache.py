@@ -55,7 +55,7 @@ def test_what_did_not_change_is_not_opened_again(addon, long_shot, opened):
     assert {"shot.json", "frames.json", "cameras.json", "solve.json", "summary.json", "take.json"} <= set(names)
     again, names = opened(read, long_shot)
     assert names == [] and again == first
-    assert first.runs["main"]["other_cameras"] and first.runs["main"]["history"] == [(1.0, 20.0)]
+    assert first.runs["main"]["has_new_cameras"] and first.runs["main"]["history"] == [(1.0, 20.0)]
 
 
 def test_what_changed_is_seen_where_folders_have_no_date(addon, long_shot):

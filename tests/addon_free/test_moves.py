@@ -100,7 +100,7 @@ def test_a_stop_is_reached_held_and_left_without_a_kink(moves):
     assert (pace >= 0).all() and (pace <= 1 + 1e-12).all()
     assert np.abs(np.diff(pace)).max() < 1.6 / 12  # smoothstep's steepest slope is 1.5 over its length
     still = np.flatnonzero(timing.frames == 50)
-    assert len(still) == 31 and timing.held[still[0]] == 0.0 and timing.held[still[-1]] == 1.0
+    assert len(still) == 31 and timing.stop_fraction[still[0]] == 0.0 and timing.stop_fraction[still[-1]] == 1.0
     assert np.allclose(pace[:29], 1.0) and np.allclose(pace[-29:], 1.0)
 
 

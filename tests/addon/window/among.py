@@ -241,7 +241,7 @@ def headless(shot: Path, output: Path, samples: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         sockets = Sockets(Path(name))
         depth, frozen = sockets.of_group("Depth")[..., 0], sockets.of_group("Image")
-        if not surfaces.is_made(shot, cube.TAKE):
+        if not surfaces.has_surface(shot, cube.TAKE):
             begin.run(scene, "freeze", contract.SurfaceParams(take=cube.TAKE))
         print(*surfaces.add(scene, shot, cube.TAKE), sep="\n")
         put(Eye(depth))

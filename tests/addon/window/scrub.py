@@ -93,8 +93,8 @@ def _sweeps(scene: Any, trained: list[int]) -> list[tuple[str, Callable[[int], N
 
 def _detailed(session: Any) -> Generator[float, None, float]:
     """Wait until the view shows a picture composited from plates; return the seconds."""
-    since, before = time.monotonic(), {frame.asked.seq for frame in session.frames.values()}
-    while not any(f.asked.detail and f.asked.seq not in before for f in session.frames.values()):
+    since, before = time.monotonic(), {frame.request.seq for frame in session.frames.values()}
+    while not any(f.request.detail and f.request.seq not in before for f in session.frames.values()):
         if time.monotonic() - since > 120:
             raise RuntimeError("the view at rest never was made of plates")
         yield 0.05
@@ -106,7 +106,7 @@ def _detailed(session: Any) -> Generator[float, None, float]:
 def _tinted(session: Any, width: int) -> Iterator[float]:
     """Wait until the guesses are shown as sharp as the previous picture."""
     since = time.monotonic()
-    while not any(f.asked.show == "guesses" and f.rgba.shape[1] >= width for f in session.frames.values()):
+    while not any(f.request.show == "guesses" and f.rgba.shape[1] >= width for f in session.frames.values()):
         if time.monotonic() - since > 120:
             raise RuntimeError("the guesses never were shown sharp")
         yield 0.05
