@@ -98,16 +98,21 @@ def needs(rates: dict[str, Rate], card: bool, megapixels: float) -> dict[str, Ne
 
 def sentences(told: Estimate, rates_from: str) -> list[str]:
     """Text of an estimate, line by line."""
-    lines = [f"{told.shots} shots, {told.tasks} tasks. By rates {rates_from}, on hosts that do one task at a time:"]
+    lines = [
+        f"{told.shots} shots, {told.tasks} tasks. Estimated from rates {rates_from}, on hosts that run one task at a "
+        "time:"
+    ]
     for row in told.rows:
         of = "sessions" if row.kind == ENGINE else "tasks"
         lines.append(f"  {row.kind:<8} {row.tasks:>6} {of:<8} {_hours(row.seconds):>10}")
     lines.append(f"Processor: {told.core_hours:.2f} core-hours.")
     if told.card_hours:
-        lines.append(f"Card: {told.card_hours:.2f} card-hours, if a card is no faster than the rates say.")
+        lines.append(f"Card: {told.card_hours:.2f} card-hours, if the card is as fast as in the rates.")
     lines.append(f"Disk: up to {told.disk_gb:.1f} GB.")
     ends = ", ".join(f"{hosts} {_hours(seconds)}" for hosts, seconds in told.on_hosts.items())
-    lines.append(f"Until the last task ends, by hosts: {ends}; never under {_hours(told.critical_seconds)}.")
+    lines.append(
+        f"Time until the last task ends, by number of hosts: {ends}; at least {_hours(told.critical_seconds)}."
+    )
     return lines
 
 

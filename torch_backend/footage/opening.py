@@ -53,7 +53,7 @@ def open_source(
     layer = "" if video.has_streams else layer
     for value, what, own in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
         if value:
-            video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {own}.", ""))
+            video.warnings.append((f"The {what} {value!r} is ignored: a video has its own, {own}.", ""))
     return video
 
 
@@ -117,5 +117,5 @@ def _pictures(path: Path, fps: float, layer: str, colours: Colours, told: Told |
     pictures = SequenceSource(find_sequence(path), fps, layer, colours, told.pixel_aspect, told.look)
     for value, what in ((told.matrix, "matrix"), (told.levels, "levels")):
         if value:
-            pictures.warnings.append((f"The {what} {value!r} is passed over: pictures hold RGB as it is.", ""))
+            pictures.warnings.append((f"The {what} {value!r} is ignored: pictures already store RGB.", ""))
     return pictures

@@ -41,8 +41,8 @@ def asked_for(
     if finished(run, its_key) is None:
         where = "the processor" if on_card else "a graphics card"
         report.warning(
-            f"The run was begun with the preset's numbers for {where}: it goes on with them.",
-            "Train it with --restart, or another run, for those of this device.",
+            f"The run was started with the preset's settings for {where}, and continues with them.",
+            "To use those for this device, train it with --restart, or train another run.",
         )
     return elsewhere, its_key, its_motion
 

@@ -109,9 +109,7 @@ def plan_memory(
         fits = peak_bytes(config, pixels, bins, budget, whole=whole, frames=frames * on_card) <= room
         if fits and (not on_card or frames <= free // 2) and (whole or moves):
             pieces = None if whole else PIECE
-            text = (
-                "" if whole else f"{_asked(budget, size, free)}: what moves is computed in pieces, which takes longer."
-            )
+            text = "" if whole else f"{_asked(budget, size, free)}: motion is computed in pieces, which is slower."
             return MemoryPlan(budget, pieces, on_card, text)
     base = peak_bytes(config, pixels, bins, 0)
     each, rest = _each(config, bins, room - base)
@@ -126,7 +124,7 @@ def plan_memory(
         )
     return MemoryPlan(
         fewer, PIECE if moves else None, False,
-        f"{_asked(budget, size, free)}: there will be {fewer:,} at most, which shows less detail. To have them all, "
+        f"{_asked(budget, size, free)}: at most {fewer:,} are used, which shows less detail. To use all of them, "
         "close other programs that use the card, choose a smaller width, or train on the processor.",
     )  # fmt: skip
 

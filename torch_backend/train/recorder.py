@@ -124,7 +124,7 @@ class Recorder:
 
     def give_up(self) -> bool:
         """Switches recording off after GPU memory ran out. Returns True if this freed the memory of a recording."""
-        held, self.refused = bool(self._recorded), "the memory of the graphics card ended"
+        held, self.refused = bool(self._recorded), "the graphics card ran out of memory"
         self.forget()
         return held
 

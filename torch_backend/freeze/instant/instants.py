@@ -114,7 +114,9 @@ class Instants:
             self._held[t_star] = made
             problem = error if isinstance(error, JobError) else path_error(error)
             why = f"{error}." if problem is None else problem.message
-            report.warning(f"The developed instant is not kept: {why}", "The next freeze at this t* develops it again.")
+            report.warning(
+                f"The developed instant was not saved: {why}", "The next freeze at this t* develops it again."
+            )
         return made
 
 
