@@ -53,7 +53,9 @@ class Blender:
         packages = site_packages(Path(python).parent.parent)
         tools = sorted(packages.glob("bpy/*/scripts/addons_core/bl_pkg/cli/blender_ext.py")) if packages else []
         if not tools:
-            raise LauncherError(f"{self.label} of {python} has no tool for extensions: name a Blender with --blender.")
+            raise LauncherError(
+                f"{self.label} of {python} has no command for extensions: choose a Blender with --blender."
+            )
         return [python, "-P", str(tools[0]), *arguments]
 
 
@@ -82,13 +84,13 @@ def named_blender(path: str) -> Blender:
     """The Blender at a user's path. Raises LauncherError if it is another program, or too old for the add-on."""
     place = os.path.abspath(path)
     if not os.path.isfile(place):
-        raise LauncherError(f"There is no Blender at {place}: give the path of its program.", ExitCode.USAGE)
+        raise LauncherError(f"There is no Blender at {place}: pass the path of the Blender program.", ExitCode.USAGE)
     version = blender_version(place)
     if version is None:
-        raise LauncherError(f"{place} does not run as a Blender: give the path of its program.", ExitCode.USAGE)
+        raise LauncherError(f"{place} does not run as Blender: pass the path of the Blender program.", ExitCode.USAGE)
     if version[0] < OLDEST_BLENDER:
         oldest = dotted(OLDEST_BLENDER)
-        raise LauncherError(f"{place} is Blender {version[1]}: name one of version {oldest} or newer.", ExitCode.USAGE)
+        raise LauncherError(f"{place} is Blender {version[1]}: version {oldest} or newer is needed.", ExitCode.USAGE)
     return program_at(place, version[1])
 
 
@@ -146,8 +148,8 @@ def get_blender(testing: bool = False, wheels: Path | None = None) -> tuple[Blen
     if refused:
         raise refused
     raise LauncherError(
-        f"No Blender can be had: Python {platform.python_version()} fits no bpy wheel (3.11 and 3.13 do) and there is "
-        "no `blender` 4.2 or newer on the PATH; install either and start the same command again."
+        f"No Blender was found: no bpy wheel fits Python {platform.python_version()} (they need 3.11 or 3.13), and "
+        "there is no `blender` 4.2 or newer on the PATH. Install either and run the same command again."
     )
 
 

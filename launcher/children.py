@@ -170,7 +170,7 @@ def exit_code_of(code: int) -> int:
         return ExitCode.CANCELLED
     if code >= 0 and not (WINDOWS and code > 255):
         return code
-    print(f"Error: a process was ended from outside ({code}), perhaps for want of memory.", file=sys.stderr, flush=True)
+    print(f"Error: a process was killed ({code}), perhaps because memory ran out.", file=sys.stderr, flush=True)
     return ExitCode.INTERNAL
 
 

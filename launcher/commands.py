@@ -38,7 +38,7 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     started = time.monotonic()
     if "://" not in clip and not any(mark in clip for mark in "#%*@") and not os.path.exists(clip):
         raise LauncherError(
-            f"There is no clip at {clip}: give the path of a video file, an image sequence or a shot folder.",
+            f"There is no clip at {clip}: pass the path of a video file, an image sequence or a shot folder.",
             ExitCode.USAGE,
         )
     backend = backend_environment()
@@ -56,7 +56,7 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
         return code
     summary = _of_a_shot(clip, options, time.monotonic() - freezing) if is_existing_shot else read_summary(output)
     if "shot" not in summary or "take" not in summary:
-        raise LauncherError(f"The backend left no figures in {output / 'summary.json'}: see the messages above.", 1)
+        raise LauncherError(f"The backend wrote no results to {output / 'summary.json'}: see the messages above.", 1)
     write_json(output / "summary.json", summary)
     # The bake adds its figures to summary.json. Wall time and set-up are added after the bake.
     say(f"Compositing in {blender.label}")
@@ -128,7 +128,7 @@ def setup(series: Sequence[str], testing: bool, backend_only: bool, output: Path
     folder = None if wheels is None else Path(os.path.abspath(wheels))
     if folder is not None and not any(folder.glob("*.whl")):
         raise LauncherError(
-            f"There are no wheels (*.whl) in {folder}: name the folder that holds them.", ExitCode.USAGE
+            f"There are no wheels (*.whl) in {folder}: pass the folder that contains them.", ExitCode.USAGE
         )
     stages = {"backend": round(set_up(backend_environment(testing), sys.executable, folder), 2)}
     for name in series:
@@ -153,8 +153,8 @@ def bench(arguments: Sequence[str], output: Path) -> int:
         blender, took = get_blender()
         if not blender.is_wheel:
             raise LauncherError(
-                "The benchmark's scenes are rendered by a bpy wheel, and none fits: start again with Python 3.11 or "
-                "3.13, or name scenes of your own by --truth or --shot."
+                "The benchmark renders its scenes with a bpy wheel, and none fits this Python. Use Python 3.11 or "
+                "3.13, or pass your own scenes with --truth or --shot."
             )
         renderer, setting_up = ["--bpy", blender.command[0]], setting_up + took
     command = [backend.python, "-P", "-m", "benchmarks.bench", "--results", str(output), "--tied", *renderer]

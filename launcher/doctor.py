@@ -81,7 +81,7 @@ def machine_findings() -> Iterator[Finding]:
     """Findings on Python, system, cores, memory and disk."""
     version = platform.python_version()
     wheels = [s for s in DEMO_WHEELS if BPY_WHEELS[s] == sys.version_info[:2]]
-    fits = f"fits bpy {' and '.join(wheels)}" if wheels else "fits no bpy wheel (3.11 and 3.13 do)"
+    fits = f"fits bpy {' and '.join(wheels)}" if wheels else "fits no bpy wheel (they need 3.11 or 3.13)"
     yield Finding("python", "ok", f"{version} at {sys.executable}; {fits}")
     if sys.maxsize < 2**32:
         yield Finding("64 bit", "missing", "this Python is 32-bit: install a 64-bit one")
@@ -95,7 +95,7 @@ def machine_findings() -> Iterator[Finding]:
         )
     folder = next(p for p in (home(), *home().parents) if os.path.exists(p))
     if not backend_environment().ready() and not (folder.is_dir() and os.access(folder, os.W_OK)):
-        yield Finding("home", "missing", f"{folder} cannot be written: name another folder in SPLANNEQUIN_HOME")
+        yield Finding("home", "missing", f"{folder} cannot be written: set SPLANNEQUIN_HOME to another folder")
     free = shutil.disk_usage(folder).free / 1e9
     backend = backend_environment()
     need = 1.0 if backend.ready() else disk_gb(backend, this_machines_index()) + BPY_DISK_GB
@@ -107,7 +107,7 @@ def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
     """Findings on NVIDIA cards: whether driver and card fit the pinned Warp and torch, and whether they are used."""
     cards, trouble = nvidia_cards()
     if trouble:
-        advice = "restart the machine; if it stays, install the driver anew"
+        advice = "restart the machine; if that does not help, reinstall the driver"
         yield Finding("gpu", "note", f"the NVIDIA driver does not answer: {trouble}: {advice}")
     elif not cards:
         yield Finding("gpu", "note", "no NVIDIA card or driver: the CPU is used, nothing is missing")
@@ -121,13 +121,13 @@ def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
 def self_test_finding(facts: dict[str, Any], output: Path) -> Finding:
     """Result of the card's self-test, whose details are written to gpu.json for a bug report."""
     if "gpu" not in facts:
-        reason = facts.get("error") or "the backend is not set up: `python3 splannequin.py setup` makes it"
+        reason = facts.get("error") or "the backend is not set up: run `python3 splannequin.py setup`"
         return Finding("self-test", "note", f"not run: {reason}")
     place = output / "gpu.json"
     write_json(place, facts)
     test = facts["gpu"]["test"]
-    ended = f"failed: {test['problem']}" if test["problem"] else f"{len(test['checks'])} checks, nothing wrong"
-    return Finding("self-test", "note" if test["problem"] else "ok", f"{ended}; {place} is what to send")
+    ended = f"failed: {test['problem']}" if test["problem"] else f"{len(test['checks'])} checks, no problems"
+    return Finding("self-test", "note" if test["problem"] else "ok", f"{ended}; the report to send is {place}")
 
 
 def gpu_finding(card: Card) -> Finding:
@@ -153,8 +153,10 @@ def backend_facts(backend: Environment, gpu: bool = False) -> dict[str, Any]:
 def backend_findings(backend: Environment, facts: dict[str, Any]) -> Iterator[Finding]:
     """Findings on the backend: its environment, torch's device and the video encoder."""
     if not facts:
-        begun = "not finished" if backend.folder.is_dir() else "not made yet"
-        yield Finding("backend", "note", f"{begun}: `python3 splannequin.py setup` makes it in {backend.folder}")
+        begun = "not finished" if backend.folder.is_dir() else "not created yet"
+        yield Finding(
+            "backend", "note", f"{begun}: run `python3 splannequin.py setup` to create it in {backend.folder}"
+        )
         return
     if "error" in facts:
         yield Finding("backend", "missing", f"{facts['error']}: remove {backend.folder} and run setup again")
@@ -183,13 +185,13 @@ def blender_findings() -> Iterator[Finding]:
     if packages:
         advice = f"install them (Debian and Ubuntu: apt install {' '.join(packages)})"
         state = "note" if found else "missing"
-        yield Finding("libraries", state, f"a bpy wheel opens libraries that are not here: {advice}")
+        yield Finding("libraries", state, f"a bpy wheel needs libraries that are missing: {advice}")
     ready = [s for s in BPY_WHEELS if bpy_environment(s).ready()]
     if ready:
         yield Finding("bpy", "ok", f"wheel(s) {', '.join(ready)} set up")
     wheels = [] if ready else choose_wheels()
     if wheels:
-        yield Finding("bpy", "note", f"not made yet: `python3 splannequin.py setup` installs bpy {wheels[0][0]}")
+        yield Finding("bpy", "note", f"not created yet: `python3 splannequin.py setup` installs bpy {wheels[0][0]}")
     if found:
         yield Finding("blender", "ok", f"{found[1]} at {found[0]}")
     elif ready or wheels:

@@ -168,7 +168,7 @@ def set_up(environment: Environment, python: str, wheels: Path | None = None) ->
     if environment.ready():
         return 0.0
     try:
-        wait = functools.partial(say, "another set-up is at work in this folder; waiting for it")
+        wait = functools.partial(say, "another set-up is running in this folder; waiting for it")
         with locked(environment.folder.parent / ".splannequin-setup.lock", wait):
             if not environment.ready():
                 _make(environment, python, wheels)
@@ -177,7 +177,7 @@ def set_up(environment: Environment, python: str, wheels: Path | None = None) ->
         advice = "free some disk" if is_disk_full(error) else "make it writable"
         raise LauncherError(
             f"{environment.name[:1].upper()}{environment.name[1:]} cannot be set up in {environment.folder.parent}: "
-            f"{where}: {error.strerror or error}; {advice}, or name another folder in SPLANNEQUIN_HOME.",
+            f"{where}: {error.strerror or error}; {advice}, or set SPLANNEQUIN_HOME to another folder.",
             ExitCode.DISK if is_disk_full(error) else ExitCode.ENVIRONMENT,
         ) from error
     return time.monotonic() - started
@@ -196,10 +196,10 @@ def _make(environment: Environment, python: str, wheels: Path | None) -> None:
     environment.log.write_bytes(b"")
     before = environment.finished()
     if not usable:
-        _step(environment, "making the virtual environment", tied_command(python, "venv", str(environment.folder)))
+        _step(environment, "creating the virtual environment", tied_command(python, "venv", str(environment.folder)))
     elif changed or environment.begun.exists():
         for name in drop_damaged(environment.folder, before.get("packages", {})):
-            say(f"  {name} is not whole: it is installed anew")
+            say(f"  {name} is incomplete: reinstalling it")
     environment.begun.touch()
     options = ["--no-input", "--progress-bar", "off", "--disable-pip-version-check", "--only-binary=:all:"]
     options += ["--no-index", "--find-links", str(wheels)] if wheels is not None else []
@@ -219,7 +219,7 @@ def _make(environment: Environment, python: str, wheels: Path | None) -> None:
                 install("installing PyTorch's CUDA libraries", *exactly, "-r", str(REQUIREMENTS / "cuda.lock"))
         else:
             # Its dependencies are already installed, except libraries of another CUDA, which that index has.
-            say(f"  the PyTorch of {index} is not in this version's list of hashes: pip checks what that index states")
+            say(f"  the PyTorch of {index} is not in this version's list of hashes: pip uses the hashes of that index")
             install("installing PyTorch", _torch_pin(), *index_options)
     _step(environment, "importing what was installed", [environment.python, "-P", "-c", environment.probe])
     venv = (environment.folder / "pyvenv.cfg").read_text(encoding="utf-8")
@@ -292,16 +292,16 @@ def _make_room(environment: Environment, needed: float) -> None:
     folder = environment.folder
     if folder.is_dir() and any(folder.iterdir()) and not environment.state.is_dir():
         raise LauncherError(
-            f"{folder} is no environment that works, and not one of this launcher's: "
-            "move it away, or name another folder in SPLANNEQUIN_HOME, and start again."
+            f"{folder} is not a working environment, and this launcher did not create it: move it, or set "
+            "SPLANNEQUIN_HOME to another folder, then start again."
         )
     if folder.is_dir():
         shutil.rmtree(folder)
     free = shutil.disk_usage(folder.parent).free / 1e9
     if free < needed:
         raise LauncherError(
-            f"Setting up {environment.name} needs {needed:.0f} GB and {folder.parent} has {free:.1f} GB "
-            "free: free some, or name a folder on another disk in SPLANNEQUIN_HOME.",
+            f"Setting up {environment.name} needs {needed:.0f} GB, but {folder.parent} has {free:.1f} GB free: free "
+            "some, or set SPLANNEQUIN_HOME to a folder on another disk.",
             ExitCode.DISK,
         )
 
@@ -315,7 +315,7 @@ def _reachable_index() -> str:
     """`this_machines_index` if it is reachable, else "". pip would retry an unreachable index for minutes."""
     index = this_machines_index()
     if index and not _reachable(index):
-        say(f"{index} cannot be reached: torch comes from the usual index")
+        say(f"{index} cannot be reached: torch is installed from the usual index")
         return ""
     return index
 

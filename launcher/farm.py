@@ -24,7 +24,9 @@ BLENDER_VARIABLE = "SPLANNEQUIN_BLENDER_COMMAND"
 def host(words: Sequence[str]) -> int:
     """`farm-host`: sets up this host if necessary, and prints the variables of its tasks (`openjd_env`)."""
     parser = argparse.ArgumentParser(prog="splannequin.py farm-host", allow_abbrev=False)
-    parser.add_argument("--python", default="", help="Python with the backend's packages (default: it is set up)")
+    parser.add_argument(
+        "--python", default="", help="Python with the backend's packages (default: set up automatically)"
+    )
     parser.add_argument("--home", default="", help="folder of the environments (default: this one)")
     parser.add_argument("--blender", default="", help="Blender's program (default: a bpy wheel, or on the PATH)")
     parser.add_argument("--bake", action="store_true", help="tasks need a Blender")

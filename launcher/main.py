@@ -30,13 +30,13 @@ from .testing import run_sensitive_tests, run_tests
 
 COMMANDS = {
     "demo": "freeze the bundled clip",
-    "freeze": "freeze your own clip, or a shot folder anew; other options go to the backend (--t-star N, ...)",
+    "freeze": "freeze your own clip, or a shot folder again; other options go to the backend (--t-star N, ...)",
     "test": "run all tests; other arguments go to pytest",
-    "bench": "the method against ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
-    "doctor": "say what this machine can do",
-    "setup": "make the environments and stop",
+    "bench": "compare the method with ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
+    "doctor": "check what this machine can do",
+    "setup": "create the environments and stop",
     "package": "build a release: the extension's zip, a repository folder, checksums and an SBOM",
-    "farm": "shots as a job for a render farm, and what it will cost; its options are the backend's",
+    "farm": "write shots as a job for a render farm, and estimate its cost; takes the backend's options",
 }
 """Commands and their help texts."""
 
@@ -64,16 +64,16 @@ def parser() -> argparse.ArgumentParser:
             )  # fmt: skip
         if name == "doctor":
             command.add_argument(
-                "--gpu", action="store_true", help="test the graphics card, and write what was found to DIR/gpu.json"
+                "--gpu", action="store_true", help="test the graphics card, and write the results to DIR/gpu.json"
             )
         if name == "setup":
-            command.add_argument("--tests", action="store_true", help="with what `test` needs")
-            command.add_argument("--backend", action="store_true", help="the backend alone (for the add-on)")
+            command.add_argument("--tests", action="store_true", help="also install what `test` needs")
+            command.add_argument("--backend", action="store_true", help="only the backend (for the add-on)")
             command.add_argument("--wheels", metavar="FOLDER", help="install from this folder of wheels, not online")
         if name == "package":
             command.add_argument(
                 "--blender", metavar="PATH", action="append", default=[],
-                help="the Blender that builds it (default: one that is found); repeated: more that validate it",
+                help="Blender that builds it (default: the first one found); more than one: the others validate it",
             )  # fmt: skip
         names = ("--output", "--results") if name == "bench" else ("--output",)
         command.add_argument(*names, metavar="DIR", help="folder for summary.json and results (output/...)")
@@ -107,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         output = Path(os.path.abspath(args.output or Path("output") / default))
     except OSError:
-        print("Error: The folder that you stand in is gone: change to another and start again.", file=sys.stderr)
+        print("Error: The current folder no longer exists: change to another folder and start again.", file=sys.stderr)
         return ExitCode.USAGE
     error = ""
     try:
@@ -121,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interrupt:
         error, code = "Cancelled.", ExitCode.CANCELLED
         if not interrupt.args:
-            print("Cancelled. Start the same command again to go on.", file=sys.stderr, flush=True)
+            print("Cancelled. Run the same command again to continue.", file=sys.stderr, flush=True)
     except OSError as failed:
         error, code = _unwritable(failed, output)
     if code and not error:
@@ -170,7 +170,7 @@ def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:
     code = ExitCode.DISK if is_disk_full(failed) else ExitCode.USAGE
     if where != output and where not in output.parents and output not in where.parents:
         code = ExitCode.DISK if code == ExitCode.DISK else ExitCode.ENVIRONMENT
-        return f"{failed.strerror or failed}: {where}. See `doctor`, then start the same command again.", code
+        return f"{failed.strerror or failed}: {where}. Run `doctor`, then run the same command again.", code
     return f"Cannot write to {output}: {failed.strerror or failed}. Choose another --output folder.", code
 
 

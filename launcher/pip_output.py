@@ -35,8 +35,8 @@ BROKEN_CONNECTION = re.compile(
 
 
 SYSTEMS = (
-    "it takes a 64-bit Python on Windows or Linux with a processor of Intel's or AMD's kind (x86-64), or on a Mac with "
-    "Apple silicon"
+    "it needs a 64-bit Python on Windows or Linux with an Intel or AMD processor (x86-64), or on a Mac with Apple "
+    "silicon"
 )
 """Systems for which all packages have wheels."""
 _UNSUPPORTED = (
@@ -77,13 +77,13 @@ def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = N
     code = ExitCode.ENVIRONMENT
     answered = re.search(r"from versions: (?!none)", output)
     if re.search(r"No space left|Errno 28|not enough space", output, re.I):
-        code, advice = ExitCode.DISK, "free some disk, or name a folder on another disk in SPLANNEQUIN_HOME"
+        code, advice = ExitCode.DISK, "free some disk, or set SPLANNEQUIN_HOME to a folder on another disk"
     elif "DO NOT MATCH THE HASHES" in output:
         last, advice = _hash_mismatch(output, wheels)
     elif wheels is not None and re.search(r"No matching distribution|from versions:", output):
         lacking = re.search(r"No matching distribution found for ([\w.=+-]+)", output)
         last = f"{wheels} has no wheel of {lacking.group(1) if lacking else 'a package'} for this Python and system"
-        advice = "put it there (docs/manual/setup.md, Without a network, says how), then start the same command again"
+        advice = "put it there (see docs/manual/setup.md, Without a network), then run the same command again"
     elif BROKEN_CONNECTION.search(output) and not answered:
         last, advice = _unreachable(output)
     elif re.search(r"ensurepip|python3-venv", output):
@@ -93,11 +93,11 @@ def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = N
         last = f"there is no {lacking.group(1) if lacking else 'package'} for {lacking_system(system)}"
         advice = SYSTEMS
     elif re.search(r"No matching distribution|from versions:", output):
-        advice = "use Python 3.11 or 3.13 on 64-bit Windows, macOS or Linux, or check the package index pip is set to"
+        advice = "use Python 3.11 or 3.13 on 64-bit Windows, macOS or Linux, or check which package index pip uses"
     elif re.search(r"lib\S+\.so\S*: cannot open shared object", output):
         advice = "install that library with the system's package manager"
     else:
-        advice = "read the log, and start the same command again: it goes on where it stopped"
+        advice = "read the log, and run the same command again: it continues where it stopped"
     raise LauncherError(f"Setting up {name} failed at {step} ({last[:200]}): {advice}. Log: {log}", code)
 
 
@@ -108,7 +108,7 @@ def _hash_mismatch(output: str, wheels: Path | None) -> tuple[str, str]:
     where = wheels or (named and urllib.parse.urlsplit(named.group(2)).hostname) or "the package index"
     last = f"the file of {package} in {where} is not the one that this version was tested with: its SHA-256 differs"
     advice = "nothing of it was installed; take that file from PyPI" if wheels else "nothing of it was installed"
-    return last, f"{advice}. If it is the index of a company, ask who runs it"
+    return last, f"{advice}. If this is a company's index, ask its administrator"
 
 
 def _unreachable(output: str) -> tuple[str, str]:
@@ -118,11 +118,11 @@ def _unreachable(output: str) -> tuple[str, str]:
     urls = [url.strip() for url in listed.group(1).split(",")] if listed else ["https://pypi.org/simple"]
     hosts = [part.hostname for part in map(urllib.parse.urlsplit, urls) if part.scheme != "file" and part.hostname]
     what = named.group(1) if named else " or ".join(dict.fromkeys(hosts)) or "the package index"
-    retry = "then start the same command again: it goes on where it stopped"
+    retry = "then run the same command again: it continues where it stopped"
     if re.search(r"ProxyError|Cannot connect to proxy", output):
-        return f"the proxy on the way to {what} cannot be used", f"check HTTPS_PROXY and pip.conf, {retry}"
+        return f"the proxy for {what} cannot be used", f"check HTTPS_PROXY and pip.conf, {retry}"
     if "SSLError" in output or "certificate" in output:
-        advice = "if a proxy signs for it, name its certificate in PIP_CERT"
+        advice = "if a proxy signs for it, set PIP_CERT to the proxy's certificate"
         return f"the certificate of {what} is not accepted", f"{advice}, {retry}"
-    advice = "check the network; behind a firewall name a proxy (HTTPS_PROXY) or an index of your own (PIP_INDEX_URL)"
+    advice = "check the network; behind a firewall, set a proxy (HTTPS_PROXY) or your own index (PIP_INDEX_URL)"
     return f"{what} cannot be reached", f"{advice}, {retry}"

@@ -72,7 +72,7 @@ def package(blenders: Sequence[str], output: Path) -> int:
     started = time.monotonic()
     chosen = [named_blender(path) for path in blenders] or [get_blender()[0]]
     work = output / ".work"
-    with locked(output / ".package.lock", lambda: say("another `package` is at work in this folder; waiting for it")):
+    with locked(output / ".package.lock", lambda: say("another `package` is running in this folder; waiting for it")):
         shutil.rmtree(work, ignore_errors=True)  # left by a killed run
         try:
             source = copy_source(work / "source")
@@ -97,7 +97,7 @@ def copy_source(folder: Path) -> Source:
     if program("git") is None:
         raise LauncherError("A package is built from a Git checkout, and there is no `git` on the PATH: install it.")
     if not (ROOT / ".git").exists():
-        raise LauncherError(f"A package is built from a Git checkout, and {ROOT} is none: clone the repository.")
+        raise LauncherError(f"A package is built from a Git checkout, and {ROOT} is not one: clone the repository.")
     commit, seconds = _git("log", "-1", "--format=%H %ct").decode().split()
     # The option is explicit because a user's settings may leave untracked files out of the status.
     status = _git("status", "--porcelain", "-z", "--no-renames", "--untracked-files=all")
@@ -180,7 +180,7 @@ class _Tool:
         reason = errors[-1].removeprefix("FATAL_ERROR: ").removeprefix("Error: ").rstrip(".")
         full = any("No space left" in line for line in lines)
         raise LauncherError(
-            f"{blender.label} cannot {arguments[0]} the extension: {reason}; all it printed is in {self.log}.",
+            f"{blender.label} cannot {arguments[0]} the extension: {reason}; its whole output is in {self.log}.",
             ExitCode.DISK if full else ExitCode.ENVIRONMENT,
         )
 
@@ -270,5 +270,5 @@ def _report(
     say(f"Extension:  {archive.name}, {archive.stat().st_size / 1e6:.1f} MB, SHA-256 {digest}")
     say(f"Built by {labels[0]} from commit {source.commit[:12]}; valid for {', '.join(labels)}.")
     if source.changed:
-        say(f"This is no release: {source.changed} files differ from the commit. Commit them and start again.")
+        say(f"This is not a release: {source.changed} files differ from the commit. Commit them and start again.")
     say(f"Nothing is signed with a key: {SUMS} shows whether a file is damaged, not who made it.")

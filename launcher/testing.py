@@ -124,7 +124,10 @@ def run_legs(legs: Sequence[Leg], backend_python: str, logs: Path | None, parall
             while waiting and len(running) < (parallel if together else 1):
                 leg = waiting.pop(0)
                 log = logs / f"{re.sub(r'[^a-z0-9.]+', '-', leg.name.lower())}.log" if together and logs else None
-                say(f"\n=== {leg.name}" + (f" (beside others; its output comes when it ends: {log})" if log else ""))
+                say(
+                    f"\n=== {leg.name}"
+                    + (f" (runs in parallel; its output follows when it ends: {log})" if log else "")
+                )
                 running[leg.start(backend_python, log, **share)] = (leg, log, time.monotonic())
             child = wait_for_any(list(running), NEWS_SECONDS)
             if child is None:
@@ -146,7 +149,7 @@ def run_legs(legs: Sequence[Leg], backend_python: str, logs: Path | None, parall
 def progress(log: Path | None) -> str:
     """Progress of a leg from its log: pytest's last "[ 34%]"."""
     shares = re.findall(r"\[ *(\d+%)\]", log.read_text(encoding="utf-8", errors="replace")) if log else []
-    return shares[-1] if shares else "at work"
+    return shares[-1] if shares else "running"
 
 
 def cores() -> int:
@@ -183,7 +186,7 @@ def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -
         blenders = [set_up_wheel(one, True)[0] for one in series] or [get_blender(testing=True)[0]]
         for blender in blenders:
             if not blender.is_wheel:
-                raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
+                raise LauncherError("The add-on's tests need a bpy wheel: use Python 3.11 or 3.13.")
             command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *extra]
             report = output / f"junit-{blender.label.replace(' ', '-')}.xml"
             legs.append(Leg(f"add-on in {blender.label}", command, report))

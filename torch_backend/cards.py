@@ -90,7 +90,7 @@ def why_unused(torch_cuda: str | None) -> tuple[str, str] | None:
         return None
     if trouble:
         sentence = f"The NVIDIA driver does not answer: {trouble}"
-        return sentence, "Restart the machine; if it stays, install the driver anew."
+        return sentence, "Restart the machine. If that does not help, reinstall the driver."
     if not cards:
         return None
     card = next((card for card in cards if card.fits), cards[0])
@@ -100,12 +100,12 @@ def why_unused(torch_cuda: str | None) -> tuple[str, str] | None:
     if torch_cuda is None:
         return (
             "PyTorch was installed without CUDA.",
-            "Remove the backend's environment and set it up again: with such a card it takes PyTorch for CUDA, unless "
-            "SPLANNEQUIN_TORCH_INDEX names an index without.",
+            "Remove the backend's environment and set it up again. This installs PyTorch for CUDA, unless "
+            "SPLANNEQUIN_TORCH_INDEX names an index without it.",
         )
     return (
-        f"PyTorch does not see {card.name}, though card and driver fit.",
-        "Restart the machine, if the driver was updated; or another program has the card to itself.",
+        f"PyTorch does not see {card.name}, although the card and its driver are supported.",
+        "Restart the machine if the driver was updated, or close the program that has exclusive use of the card.",
     )
 
 
@@ -119,5 +119,8 @@ def why_unfit(card: Card) -> tuple[str, str] | None:
             message = f"{card.name} has driver {card.driver}, and R{NEEDED_DRIVER} or newer is needed."
             return message, "Update the NVIDIA driver and restart the machine."
     except ValueError:
-        return f"{card.name} with driver {card.driver} and compute capability {card.compute} is not understood.", ""
+        return (
+            f"{card.name} reports driver {card.driver} and compute capability {card.compute}, which Splannequin "
+            "cannot interpret."
+        ), ""
     return None

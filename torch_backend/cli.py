@@ -49,7 +49,7 @@ class Console:
         elif event.type == "error":
             self._line(contract.printable(f"Error: {event.data['message']} {event.data['hint']}".rstrip()))
         elif event.type == "done" and event.data["state"] == "cancelled":
-            self._line("Cancelled. Start the same command again to go on: finished work is kept.")
+            self._line("Cancelled. Run the same command again to continue: finished work is kept.")
 
     def begins(self, kind: str, total: contract.TotalProgress | None) -> None:
         """Notes that a job of `kind` begins. `total`: progress of the sequence of jobs to which the job belongs."""
@@ -132,7 +132,8 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
         print(f"Surface: {result['surface']}", file=console.stream, flush=True)
     if kind == "light" and not console.as_json:
         message = (
-            f"Light: {result['light']}, an estimate: {result['filled']:.0%} of the sphere was not seen, and is filled."
+            f"Light: {result['light']}. This is an estimate: {result['filled']:.0%} of the sphere was not seen and "
+            "is filled in."
         )
         print(message, file=console.stream, flush=True)
     return ExitCode.OK
@@ -376,9 +377,9 @@ def stmaps(args: argparse.Namespace, console: Console) -> int:
         return ExitCode.OK
     across, down = facts["overscan_percent"]
     print(
-        f"Undistort: {facts['undistort']}\nRedistort: {facts['redistort']}\n"
-        f"The lens sees {across:.1f} % of the width beyond each side of the undistorted frames, "
-        f"and {down:.1f} % of the height: --overscan lens freezes that too.",
+        f"Undistort: {facts['undistort']}\nRedistort: {facts['redistort']}\nThe lens sees {across:.1f} % of the "
+        f"width beyond each side of the undistorted frames, and {down:.1f} % of the height. Freeze with --overscan "
+        "lens to include that.",
         file=console.stream,
     )
     return ExitCode.OK
@@ -393,7 +394,7 @@ def farm(args: argparse.Namespace, console: Console) -> int:
     if words.action == "measure":
         found = rates.measure(record for shot in words.shots for record in records.read(Path(shot)))
         if not found:
-            raise contract.JobError("No task of a farm left figures in these shots.", "", ExitCode.USAGE)
+            raise contract.JobError("These shots contain no timings of farm tasks.", "", ExitCode.USAGE)
         write_json(output / export.RATES_FILE, rates.to_json(found))
         print(output / export.RATES_FILE, file=console.stream)
         return ExitCode.OK

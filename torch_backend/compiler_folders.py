@@ -65,7 +65,7 @@ def compiler_folders(
         where = kernels if moved[0] else package
         raise JobError(
             f"Kernels cannot be compiled: the compiler cannot open {where}, whose name is not plain ASCII.",
-            "Set the environment variable PROGRAMDATA, or PUBLIC, to a folder with a plain name that can be written.",
+            "Set the environment variable PROGRAMDATA or PUBLIC to a writable folder with an ASCII name.",
             ExitCode.ENVIRONMENT,
         )
     return CompilerFolders(

@@ -206,7 +206,7 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
     blender = os.environ.get(BLENDER_VARIABLE, "")
     if not blender:
         raise JobError(
-            "This host was given no Blender.", "Enter the job's environment with --bake.", ExitCode.ENVIRONMENT
+            "No Blender is set up on this host.", "Enter the job's environment with --bake.", ExitCode.ENVIRONMENT
         )
     params = _freezing(args, request)
     first, last = params.first or 0, params.last or 0

@@ -95,8 +95,8 @@ class JobReporter:
         if self._missed >= _MISSED_BEATS:
             raise contract.MissingError(f"{self.folder} is gone")
         if self._new_writer is not None:  # another job owns the shot now, so this one writes no more
-            message = f"The shot was taken over by {self._new_writer.host}: this computer had fallen silent."
-            raise JobError(message, "It goes on there.", ExitCode.USAGE)
+            message = f"{self._new_writer.host} took over the shot, because this computer stopped responding."
+            raise JobError(message, "The work continues there.", ExitCode.USAGE)
         now = time.monotonic()
         if not self._cancelled and now - self._last_poll >= _CANCEL_POLL_SECONDS:
             self._last_poll = now
@@ -210,7 +210,7 @@ def run_job(
         contract.check_version(data, "job request")
         request: JobRequest = contract.from_dict(JobRequest, data)
     except (OSError, ValueError, KeyError) as error:
-        print(f"{folder} holds no job that can be run: {error}", file=sys.stderr)
+        print(f"{folder} contains no job that can be run: {error}", file=sys.stderr)
         return ExitCode.USAGE, None
     with working_on(Path(request.shot).absolute(), folder.parent.parent):
         reporter = JobReporter(folder, request.kind, listener)
@@ -239,7 +239,7 @@ def _run(
             _learn_pace(shot, request.kind, params, time.monotonic() - since)
     except Cancelled:
         state, code = "cancelled", int(ExitCode.CANCELLED)
-        message, hint = "Cancelled.", "Start it again to go on: finished work is kept."
+        message, hint = "Cancelled.", "Start it again to continue: finished work is kept."
     except KeyboardInterrupt:
         state, code, message = "cancelled", int(ExitCode.CANCELLED), "Cancelled."
     except JobError as error:
@@ -253,8 +253,8 @@ def _run(
         if type(error).__name__ == "OutOfMemoryError":  # torch raises it for a card
             message = "The graphics card is out of memory."
             hint = (
-                "Close other programs that use it, choose a smaller width or fewer Gaussians, or the processor as the "
-                "device."
+                "Close other programs that use it, choose a smaller width or fewer Gaussians, or use the processor "
+                "as the device."
             )
         elif isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
             message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."

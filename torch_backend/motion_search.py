@@ -95,7 +95,7 @@ def _static_views(shot: Shot, static_model: StaticModel | None, report: Reporter
     try:
         return static_model(shot, report)
     except JobError as error:
-        report.warning(f"What moves is told by optical flow alone: {error}", error.hint)
+        report.warning(f"Motion is found by optical flow only: {error}", error.hint)
         return None
 
 
@@ -141,8 +141,8 @@ def motion_after_solve(
         raise
     except Exception as error:  # OpenCV raises its own exception classes
         report.warning(
-            f"What moves by itself could not be told from the pictures: {' '.join(str(error).split())[:300]}",
-            "The cameras are whole; solve again to try once more.",
+            f"Moving areas could not be found: {' '.join(str(error).split())[:300]}",
+            "The cameras are fine. Solve again to retry.",
         )
         return None
     if (doubt := doubt_of(found["motion_pixels_share"])) is not None:

@@ -165,7 +165,7 @@ def _normalisation(viewmats: np.ndarray, points: np.ndarray) -> tuple[float, np.
     depth = float(np.median(np.linalg.norm(points - centre, axis=1))) if len(points) else 0.0
     if not np.isfinite(extent) or extent <= 1e-4 * max(depth, 1e-12):
         raise JobError(
-            "The camera hardly moves in this clip, so depth cannot be told.",
+            "The camera hardly moves in this clip, so depth cannot be estimated.",
             "Use footage in which the camera travels.",
             ExitCode.SOLVE,
         )
@@ -237,7 +237,7 @@ def _mapped(folder: Path, shape: tuple[int, ...]) -> Tensor:
     """float16 tensor mapped from a temporary file in `folder`, which vanishes with the process."""
     size = 2 * math.prod(shape)
     make_folder(folder)
-    need_disk(folder, size, "Frames for the training, which are too many for the memory,")
+    need_disk(folder, size, "The file of training frames that do not fit into memory")
     with tempfile.TemporaryFile(dir=folder, prefix="frames-") as file:
         if hasattr(os, "posix_fallocate"):  # a disk that fills up later would kill the process
             os.posix_fallocate(file.fileno(), 0, size)

@@ -128,14 +128,14 @@ def _take(root: Path, writer: Writer) -> None:
             holder = contract.read_writer(root)
         except (OSError, ValueError) as error:  # being written just now, or by another program
             if time.monotonic() > deadline:
-                hint = f"If nothing works on this shot, delete {path}."
-                raise JobError(f"Whether a step works on {root.name} cannot be told: {error}.", hint, ExitCode.USAGE) \
+                hint = f"If no step runs on this shot, delete {path}."
+                raise JobError(f"Cannot find out whether a step runs on {root.name}: {error}.", hint, ExitCode.USAGE) \
                     from error  # fmt: skip
             time.sleep(0.05)
             continue
         if holder is None:  # released in between, or a dangling link
             if time.monotonic() > deadline:
-                what = f"{path} cannot be made, and names nobody who works on {root.name}."
+                what = f"{path} cannot be created, and it does not say which computer works on {root.name}."
                 raise JobError(what, "Delete it, then start again.", ExitCode.USAGE)
             time.sleep(0.01)
             continue
@@ -147,7 +147,7 @@ def _take(root: Path, writer: Writer) -> None:
         if _take_over(path, holder, writer):
             return
         if time.monotonic() > deadline:
-            what = f"{path} was left by a step that was ended, and cannot be replaced."
+            what = f"{path} was left behind by a stopped step and cannot be replaced."
             raise JobError(what, "Delete it, then start again.", ExitCode.USAGE)
         time.sleep(0.01)
 

@@ -154,7 +154,7 @@ def test_an_st_map_is_handed_on_with_its_way_and_only_where_the_lens_is_ours_to_
     asked = solve.params(scene)
     assert (asked.st_map, asked.st_map_way, asked.st_map_layer) == (str(shot / "lens.exr"), "redistort", "back")
     props.cameras_from, props.cameras_path = "FILE", str(shot / "model")
-    assert solve.params(scene).st_map == "", "cameras from elsewhere bring their own lens"
+    assert solve.params(scene).st_map == "", "imported cameras already have a lens"
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap_text", "nerfstudio"])
@@ -187,7 +187,7 @@ def test_the_export_button_says_what_is_wrong(scene, shot, tmp_path):
         bpy.ops.splannequin.export_cameras(directory=str(tmp_path / "out"))
     scene.splannequin.shot_path = str(shot)
     bpy.ops.splannequin.export_cameras(directory=str(tmp_path / "out"))
-    with pytest.raises(RuntimeError, match=r"holds another COLMAP model already \(cameras\.bin\)"):
+    with pytest.raises(RuntimeError, match=r"already contains another COLMAP model \(cameras\.bin\)"):
         bpy.ops.splannequin.export_cameras(directory=str(tmp_path / "out"), format="colmap_text")
 
 

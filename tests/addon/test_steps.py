@@ -80,7 +80,7 @@ def test_an_artists_own_folder_is_not_filled(scene, clip, tmp_path):
     mine.mkdir()
     (mine / "scene.blend").write_bytes(b"BLENDER")
     scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(mine)
-    with pytest.raises(RuntimeError, match=r"holds other files \(scene\.blend\)\. Choose a folder that is empty"):
+    with pytest.raises(RuntimeError, match=r"contains other files \(scene\.blend\)\. Choose an empty or new folder"):
         bpy.ops.splannequin.import_clip()
     assert [p.name for p in mine.iterdir()] == ["scene.blend"]
 

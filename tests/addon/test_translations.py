@@ -192,7 +192,7 @@ def test_composed_sentences_are_translated_with_their_values(addon):
             "Pegel: voll, kein Alpha.",
         ),
         (
-            "Assumed, for the footage does not say: pixel aspect, colour space, levels.",
+            "Assumed, because the footage does not state it: pixel aspect, colour space, levels.",
             "Angenommen, denn das Material sagt es nicht: Pixelseitenverhältnis, Farbraum, Pegel.",
         ),
         ("An unknown sentence. Choose another shot folder.", "An unknown sentence. Einen anderen Shot-Ordner wählen."),

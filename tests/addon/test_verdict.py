@@ -6,7 +6,7 @@ import json
 import pytest
 
 RUN = {"word": "fair", "sentences": ["It does not hold in frames 10 to 31, lower left."], "where": [],
-       "advice": ["Choose t* in frames 34 to 73, or train on that range alone."]}  # fmt: skip
+       "advice": ["Choose t* in frames 34 to 73, or train only on that range."]}  # fmt: skip
 TAKE = {"word": "good", "sentences": ["98 % of the picture is plate, 2 % is a guess."]}
 
 
@@ -27,7 +27,7 @@ def test_a_verdict_stands_once_a_runs_under_train_and_a_takes_under_freeze(addon
     state = shots.read(shot)
     assert addon("process.steps").STEPS["train"].view(with_shot, state).state[:2] == [
         "Fair. It does not hold in frames 10 to 31, lower left.",
-        "Choose t* in frames 34 to 73, or train on that range alone.",
+        "Choose t* in frames 34 to 73, or train only on that range.",
     ]
     assert (
         addon("process.steps").STEPS["freeze"].view(with_shot, state).state[1]

@@ -122,7 +122,7 @@ def test_export_writes_and_refuses_in_words(world, tmp_path):
     assert "1 PINHOLE 64 48 60.0 60.0 32.0 24.0" in written[0].read_text()
     refused = run("export", world.shot.root, "--output", tmp_path / "out")
     assert refused.returncode == ExitCode.USAGE
-    assert refused.stderr.startswith("Error: ") and "holds another COLMAP model already" in refused.stderr
+    assert refused.stderr.startswith("Error: ") and "already contains another COLMAP model" in refused.stderr
 
 
 def test_solve_refuses_cameras_that_are_not_there(world, tmp_path):
@@ -163,7 +163,7 @@ def test_a_failed_import_leaves_no_empty_shot(tmp_path):
     done = run("import", tmp_path / "s.splannequin", wrong)
     assert done.returncode == ExitCode.FOOTAGE and "text.mp4" in done.stdout
     done = run("import", tmp_path / "mine", wrong)
-    assert done.returncode == ExitCode.USAGE and "holds other files (notes.txt)" in done.stderr
+    assert done.returncode == ExitCode.USAGE and "contains other files (notes.txt)" in done.stderr
     assert run("freeze", wrong, "--output", tmp_path / "out").returncode == ExitCode.FOOTAGE
     assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
     assert [p.name for p in (tmp_path / "mine").iterdir()] == ["notes.txt"]
@@ -182,7 +182,7 @@ def test_a_shot_of_another_clip_is_not_used_again(tmp_path, capsys):
     assert cli.main(["import", str(shot), clips[0]]) == 0
     before = (shot / "frames" / "frames.json").read_bytes()
     assert cli.main(["freeze", clips[1], "--output", str(tmp_path / "out")]) == ExitCode.USAGE
-    assert f"is the shot of another clip: {clips[0]}" in capsys.readouterr().err
+    assert f"is the shot folder of another clip: {clips[0]}" in capsys.readouterr().err
     assert (shot / "frames" / "frames.json").read_bytes() == before
     words = ["--output", str(tmp_path / "out"), "--t-star", "99"]
     assert cli.main(["freeze", str(tmp_path / "copy" / "p.0000.png"), *words]) == ExitCode.USAGE

@@ -151,7 +151,7 @@ def test_a_host_without_blender_says_so(task, monkeypatch, submitted, tmp_path, 
     shot = str(submitted / "shots" / "tiny.splannequin")
     words = ["--shot", shot, "--request", str(tmp_path / "request.json"), "--t-star=104", "--output", str(tmp_path)]
     assert cli.main(["farm-task", "bake", *words]) == ExitCode.ENVIRONMENT
-    assert "openjd_fail: tiny, bake a: This host was given no Blender." in capsys.readouterr().out
+    assert "openjd_fail: tiny, bake a: No Blender is set up on this host." in capsys.readouterr().out
 
 
 def test_two_shots_of_one_name_are_baked_into_two_folders(imported_shots, tmp_path, monkeypatch, capsys):

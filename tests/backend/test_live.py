@@ -312,7 +312,7 @@ def test_messages_survive_a_pipe_that_gives_little_at_a_time():
     assert read_message(stream) == ({"kind": "x"}, b"abcdefgh")
     assert read_message(stream) is None
     assert read_message(io.BytesIO(whole[:-1])) is None
-    with pytest.raises(ValueError, match="no message"):
+    with pytest.raises(ValueError, match="not a message"):
         read_message(io.BytesIO(b"Traceback (most recent call last):"))
     with pytest.raises(ValueError, match="JSON object"):
         read_message(io.BytesIO(whole.replace(json.dumps({"kind": "x"}).encode(), b'["kind", "x"]')[:]))

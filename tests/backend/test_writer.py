@@ -154,7 +154,10 @@ def test_another_computers_lock_is_never_taken_over(shot):
 def test_a_lock_that_cannot_be_read_is_left_alone_and_named(shot, text, monkeypatch):
     monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
     lock_of(shot).write_text(text)
-    with pytest.raises(JobError, match="cannot be told") as told, only_writer(shot.root, "import", "mine"):
+    with (
+        pytest.raises(JobError, match="Cannot find out whether a step runs") as told,
+        only_writer(shot.root, "import", "mine"),
+    ):
         raise AssertionError("it was taken")
     assert str(lock_of(shot)) in told.value.hint and lock_of(shot).read_text() == text
 
@@ -174,7 +177,7 @@ def test_a_lock_that_is_a_link_is_not_written_through(shot, tmp_path, monkeypatc
 def test_a_lock_that_is_a_link_to_nowhere_is_named(shot, tmp_path, monkeypatch):
     monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
     lock_of(shot).symlink_to(tmp_path / "nowhere")
-    with pytest.raises(JobError, match="cannot be made") as told, only_writer(shot.root, "import", "mine"):
+    with pytest.raises(JobError, match="cannot be created") as told, only_writer(shot.root, "import", "mine"):
         raise AssertionError("it was taken")
     assert str(lock_of(shot)) in told.value.message and not (tmp_path / "nowhere").exists()
 
@@ -194,7 +197,7 @@ def test_a_job_whose_shot_was_taken_over_ends_and_leaves_it_to_the_other(shot, m
     monkeypatch.setitem(job.RUNNERS, "import", station)
     folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
     assert job.run_job(folder)[0] == ExitCode.USAGE
-    assert status_of(folder).message.startswith(f"The shot was taken over by {ELSEWHERE}")
+    assert status_of(folder).message.startswith(f"{ELSEWHERE} took over the shot")
     assert contract.read_writer(shot.root) == other
 
 
@@ -253,7 +256,7 @@ def test_a_shot_that_is_moved_ends_its_training_in_a_sentence(world, tmp_path):
     os.rename(root, away)
     _, errors = child.communicate()
     assert child.returncode == ExitCode.USAGE
-    assert f"The training ended: the shot folder {root} was moved or deleted meanwhile." in errors
+    assert f"The training stopped: the shot folder {root} was moved or deleted in the meantime." in errors
     assert not root.exists(), [str(p) for p in root.rglob("*")]
     events = [json.loads(line) for line in (away / "jobs" / folder.name / "events.jsonl").read_text().splitlines()]
     assert [e["type"] for e in events[-2:]] == ["error", "done"] and "was moved" in events[-2]["data"]["message"]

@@ -31,7 +31,7 @@ def summary(folder: Path) -> dict:
 
 def test_doctor_before_set_up_says_so(tmp_path: Path):
     ran = launch("doctor", "--output", tmp_path, SPLANNEQUIN_HOME=str(tmp_path / "nothing here yet"))
-    assert "not made yet: `python3 splannequin.py setup`" in ran.stdout
+    assert "not created yet: `python3 splannequin.py setup`" in ran.stdout
     found = summary(tmp_path)
     assert found["exit_code"] == ran.returncode
     assert found["findings"]["backend"]["state"] == "note"
@@ -42,7 +42,7 @@ def test_a_name_that_the_console_has_no_letters_for_ends_nothing(tmp_path: Path)
     """Output redirected to a file on Windows uses a code page that lacks many characters."""
     home = tmp_path / "\N{CJK UNIFIED IDEOGRAPH-65E5}"
     ran = launch("doctor", "--output", tmp_path, SPLANNEQUIN_HOME=str(home), PYTHONIOENCODING="cp1252")
-    assert "makes it in" in ran.stdout and "\\u65e5" in ran.stdout and "Traceback" not in ran.stderr
+    assert "to create it in" in ran.stdout and "\\u65e5" in ran.stdout and "Traceback" not in ran.stderr
 
 
 def test_a_clip_that_is_not_there_is_one_sentence_and_sets_nothing_up(tmp_path: Path):
@@ -233,7 +233,7 @@ def test_an_old_python_says_which_one_is_needed(tmp_path: Path):
         ("610.10", "7.5", "ok", "compute capability 7.5"),
         ("575.57.08", "8.9", "note", "R580"),
         ("580.65.06", "7.0", "note", "7.5 (Turing) or newer"),
-        ("[N/A]", "8.9", "note", "not understood"),
+        ("[N/A]", "8.9", "note", "cannot interpret"),
     ],
 )
 def test_cards_are_held_against_what_warp_needs(driver: str, compute: str, state: str, says: str):

@@ -236,7 +236,7 @@ def test_a_folder_of_someone_else_is_left_alone(environment: Environment):
     environment.folder.mkdir(parents=True)
     precious = environment.folder / "precious.txt"
     precious.touch()
-    with pytest.raises(LauncherError, match="move it away") as refused:
+    with pytest.raises(LauncherError, match="move it, or set SPLANNEQUIN_HOME") as refused:
         set_up(environment, sys.executable)
     assert precious.exists()
     assert refused.value.exit_code == 9
@@ -305,7 +305,7 @@ def test_an_index_out_of_reach_is_not_reckoned_with(
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(5e9)))
     with pytest.raises(LauncherError, match="needs 9 GB"):
         set_up(backend, sys.executable)
-    assert "cannot be reached: torch comes from the usual index" in capsys.readouterr().out
+    assert "cannot be reached: torch is installed from the usual index" in capsys.readouterr().out
 
 
 def test_no_other_environment_has_torch():
@@ -400,13 +400,13 @@ def test_an_index_that_cannot_be_reached_is_what_is_wrong(
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)
     message = str(refused.value)
-    assert "127.0.0.1 cannot be reached" in message and "HTTPS_PROXY" in message and "start the same command" in message
+    assert "127.0.0.1 cannot be reached" in message and "HTTPS_PROXY" in message and "run the same command" in message
     assert "Python 3" not in message and "secret" not in message
     assert refused.value.exit_code == 9
 
     monkeypatch.setenv("PIP_INDEX_URL", "https://packages.invalid/simple")
     monkeypatch.setenv("HTTPS_PROXY", "http://127.0.0.1:9")
-    with pytest.raises(LauncherError, match="the proxy on the way to packages.invalid cannot be used"):
+    with pytest.raises(LauncherError, match="the proxy for packages.invalid cannot be used"):
         set_up(environment, sys.executable)
 
 

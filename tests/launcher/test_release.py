@@ -131,7 +131,7 @@ def test_a_package_is_whole_and_the_same_from_the_same_commit(checkout: Path, bl
 def test_what_is_not_committed_is_no_release(checkout: Path, blender_program, tmp_path: Path):
     (checkout / "launcher" / "new.py").touch()
     done = package(checkout, tmp_path / "out", "--blender", blender_program())
-    assert done.returncode == 0 and "This is no release: 1 files differ" in done.stdout
+    assert done.returncode == 0 and "This is not a release: 1 files differ" in done.stdout
     assert results(tmp_path / "out") == {f"{NAME}-uncommitted"}
 
 

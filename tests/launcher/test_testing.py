@@ -73,7 +73,7 @@ def test_one_leg_at_a_time_prints_as_it_goes(tmp_path: Path, capfd):
 def test_how_far_a_leg_is_comes_from_what_pytest_prints(tmp_path: Path):
     log = tmp_path / "backend.log"
     log.write_text("collected 3 items\n")
-    assert progress(log) == "at work"
+    assert progress(log) == "running"
     log.write_text("tests/a.py ..  [  3%]\ntests/b.py .  [ 34%]\ntests/c.py .")
     assert progress(log) == "34%"
 

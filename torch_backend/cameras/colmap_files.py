@@ -119,7 +119,7 @@ def read_model(folder: Path) -> ColmapModel:
     """
     files = model_files(folder)
     if not files:
-        raise MissingError(f"{folder} holds no COLMAP model: cameras and images, as .bin or .txt")
+        raise MissingError(f"{folder} contains no COLMAP model (cameras and images, as .bin or .txt)")
     binary = files[0].suffix == ".bin"
     points = ColmapPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), [])
     at = files[0]
@@ -133,12 +133,14 @@ def read_model(folder: Path) -> ColmapModel:
     except UnreadableFile:
         raise
     except (struct.error, IndexError, OverflowError, UnicodeDecodeError) as error:
-        raise ValueError(f"{at} is no file of a COLMAP model, or it is cut off: {error}") from error
+        raise ValueError(f"{at} is not a COLMAP model file, or it is truncated: {error}") from error
     except ValueError as error:
-        raise ValueError(f"{at} is no file of a COLMAP model: {error}") from error
+        raise ValueError(f"{at} is not a COLMAP model file: {error}") from error
     for image in images:
         if image.camera not in cameras:
-            raise ValueError(f"{files[1]}: image {image.name} has camera {image.camera}, which {files[0].name} lacks")
+            raise ValueError(
+                f"{files[1]}: image {image.name} uses camera {image.camera}, which is missing from {files[0].name}"
+            )
     return ColmapModel(cameras, images, points)
 
 
@@ -228,7 +230,7 @@ def _points_bin(path: Path) -> ColmapPoints:
     file = _Bytes(path)
     count = file.take("Q")[0]
     if count > _MOST_POINTS:
-        raise ValueError(f"it tells of {count} points")
+        raise ValueError(f"it claims to have {count} points")
     rows: list[list[float]] = []
     tracks: list[NDArray[np.int64]] = []
     for _ in range(count):

@@ -61,7 +61,9 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False, plac
     existing = next((file for file in conflicting if file.is_file()), None)
     if existing is not None:
         raise JobError(
-            f"{folder} holds another COLMAP model already ({existing.name}).", "Choose another folder.", ExitCode.USAGE
+            f"{folder} already contains another COLMAP model ({existing.name}).",
+            "Choose another folder.",
+            ExitCode.USAGE,
         )
     return write_model(folder, _model(path, points), text)
 

@@ -129,7 +129,7 @@ def find(path: str | Path) -> tuple[str, list[Path]]:
             return "json", [path]
         if path.suffix.lower() in _BLENDERS:
             raise _refusal(
-                f"{path.name} is read by Blender alone.",
+                f"Only Blender can read {path.name}.",
                 "Solve in Blender, or with `blender --background --command splannequin`.",
             )
         path = path.parent  # the user chose one file of a COLMAP model
@@ -140,9 +140,9 @@ def find(path: str | Path) -> tuple[str, list[Path]]:
     if (path / "transforms.json").is_file():
         return "json", [path / "transforms.json"]
     raise _refusal(
-        f"{path} holds no cameras: neither a COLMAP model (cameras and images, .bin or .txt, also in sparse/0) nor a "
-        "transforms.json.",
-        "Choose the folder of the model or the file.",
+        f"{path} contains no cameras. It needs a COLMAP model (cameras and images, .bin or .txt, also in sparse/0) "
+        "or a transforms.json.",
+        "Choose the model's folder, or the file.",
     )
 
 
@@ -166,11 +166,12 @@ def read(path: str | Path) -> ImportedSolve:
         data = read_json(files[0])
         frames = data.get("frames")
         if not isinstance(frames, list) or not frames or not all(map(is_json_object, cast("list[Any]", frames))):
-            raise ValueError(f"{files[0]} lists no frames, or something else among them")
+            raise ValueError(f"{files[0]} lists no frames, or some of its entries are not frames")
         return _from_path(files[0], data) if "viewmat" in frames[0] else _from_transforms(files[0], data)
     except (ValueError, TypeError) as error:
         raise _refusal(
-            f"These cameras cannot be used: {printable(str(error)).rstrip('.')}.", "Export them again, or solve here."
+            f"These cameras cannot be used: {printable(str(error)).rstrip('.')}.",
+            "Export them again, or solve the camera here.",
         ) from error
 
 
@@ -208,14 +209,14 @@ def lens_from_colmap(model: str, width: int, height: int, params: Sequence[float
         return _lens("OPENCV_FISHEYE", width, height, (*p[:4], *bend))
     if model in ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"):
         return _lens(model, width, height, p)
-    raise ValueError(f"the lens model {model} is not supported: pinhole, radial, OpenCV and OpenCV fisheye models are")
+    raise ValueError(f"the lens model {model} is not supported: use a pinhole, radial, OpenCV or OpenCV fisheye model")
 
 
 def _lens(model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
     if width < 1 or height < 1:
-        raise ValueError(f"a camera is of pictures of {width} x {height} pixels")
+        raise ValueError(f"a camera's image size is {width} x {height} pixels")
     if not all(map(math.isfinite, params)) or params[0] <= 0 or params[1] <= 0:
-        raise ValueError("a focal length is not above 0, or a number of a lens is not finite")
+        raise ValueError("a focal length is not above 0, or a lens parameter is not finite")
     if model != "OPENCV_FISHEYE" and not any(params[4:]):
         return Lens("PINHOLE", width, height, params[:4])
     return Lens(model, width, height, params)
@@ -270,7 +271,7 @@ def _transforms_lens(file: Path, values: dict[str, Any]) -> Lens:
     def number(name: str, otherwise: float | None = None) -> float:
         value = values.get(name, otherwise)
         if value is None or isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ValueError(f"{file} has no {name}, the lens cannot be told")
+            raise ValueError(f"{file} has no {name}, so the lens is unknown")
         return float(value)
 
     width, height = int(number("w")), int(number("h"))
@@ -283,9 +284,9 @@ def _transforms_lens(file: Path, values: dict[str, Any]) -> Lens:
     if model == "OPENCV_FISHEYE":
         return _lens(model, width, height, (*pinhole, k1, k2, k3, k4))
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"):
-        raise ValueError(f"the camera_model {model} of {file} is not supported: OPENCV and OPENCV_FISHEYE are")
+        raise ValueError(f"the camera_model {model} in {file} is not supported: use OPENCV or OPENCV_FISHEYE")
     if k4:
-        raise ValueError(f"{file} has a k4 in a lens that is no fisheye, which is not supported")
+        raise ValueError(f"{file} has a k4 for a lens that is not a fisheye, which is not supported")
     if k3:
         return _lens("FULL_OPENCV", width, height, (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
     return _lens("OPENCV", width, height, (*pinhole, k1, k2, p1, p2))
@@ -300,7 +301,9 @@ def _rigid(matrix: NDArray[Any], name: str) -> NDArray[np.float64]:
         raise ValueError(f"the camera of {name} is not finite")
     rotation = matrix[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_SLACK or np.linalg.det(rotation) < 0:
-        raise ValueError(f"the camera of {name} is no rotation and position: it is scaled, sheared or mirrored")
+        raise ValueError(
+            f"the camera of {name} is scaled, sheared or mirrored: only a rotation and a position are supported"
+        )
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt, matrix[:3, 3:]], axis=1)
 
@@ -334,8 +337,8 @@ def match(
     if len(fitting) > 1:
         names = ", ".join(name for name, _, _ in fitting[:4])
         raise _refusal(
-            f"The cameras' pictures are {len(fitting)} sequences that could be this clip: {names}.",
-            "Use a solve of this one clip alone.",
+            f"The cameras' pictures form {len(fitting)} sequences that could be this clip: {names}.",
+            "Use a solve of this clip only.",
         )
     closest = max(fitting or paired, key=lambda one: len(one[1]), default=None)
     table, chosen = closest[1:] if closest else ({}, Pairing({}))
@@ -349,14 +352,14 @@ def match(
         raise _refusal(
             f"Only {found} of the {len(needed)} frames needed, from {frames[0]} to {frames[-1]}, have a camera in "
             f"{solve.path.name or solve.path}: {numbering}.",
-            "Pictures are matched by the frame number in their names: name them as the clip counts.",
+            "Pictures are matched by the frame number in their names: number them like the clip's frames.",
         )
     for lens in (solve.lenses[n] for n in sorted({c.lens for c in cameras.values()})):
         ratio = (lens.width / lens.height) / (size[0] / size[1])
         if abs(ratio - 1.0) > ASPECT_SLACK:
             raise _refusal(
-                f"The cameras are of pictures of {lens.width} x {lens.height} pixels, the shot's frames have another "
-                f"shape, {size[0]} x {size[1]}.",
+                f"The cameras' pictures are {lens.width} x {lens.height} pixels, but the shot's frames have another "
+                f"aspect ratio, {size[0]} x {size[1]}.",
                 "Use cameras of the same, uncropped clip.",
             )
     words = pairing_words("The cameras' file", sorted(table), chosen)
@@ -371,14 +374,14 @@ def _tables(solve: ImportedSolve) -> dict[str, dict[int, ImportedCamera]]:
     for camera in solve.cameras:
         name = camera.name.replace("\\", "/")
         if name in of_name:
-            raise _refusal(f"{name} has two cameras in {solve.path.name}.", "Use a solve of this one clip alone.")
+            raise _refusal(f"{name} has two cameras in {solve.path.name}.", "Use a solve of this clip only.")
         of_name[name] = camera
     tables: dict[str, dict[int, ImportedCamera]] = {}
     for found in numbered_files(of_name):
         if found.twice:
             raise _refusal(
                 f"The pictures {found.twice[0]} and {found.twice[1]} of the cameras have the same frame number.",
-                "Use a solve of this one clip alone.",
+                "Use a solve of this clip only.",
             )
         tables[found.pattern] = {number: of_name[name] for number, name in found.files.items()}
     return tables
@@ -391,7 +394,7 @@ def remarks(solve: ImportedSolve, matched: Matched) -> list[tuple[str, str]]:
         remarks.append(
             (
                 f"{len(matched.missing)} frames have no camera in {solve.path.name}: {frame_words(matched.missing)}.",
-                "Their cameras are placed between their neighbours'.",
+                "Their cameras are interpolated from their neighbours.",
             )
         )
     return remarks

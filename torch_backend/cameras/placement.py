@@ -78,8 +78,8 @@ def placement_for(shot: Shot, file: str = "") -> Placement:
         placement = Placement.load(file)
         if placement.solve not in ("", solve):
             raise UserError(
-                f"{file} places another solve of this shot.",
-                "Open the shot in Blender: it is written anew with the next step.",
+                f"{file} belongs to another solve of this shot.",
+                "Open the shot in Blender: the next step writes the file again.",
             )
         return placement
     if not shot.placement.is_file():

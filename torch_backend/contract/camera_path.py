@@ -80,4 +80,4 @@ class CameraPath:
         try:
             return CameraPath.from_json(data)
         except (ValueError, TypeError, AttributeError, OverflowError) as error:
-            raise UserError(f"{path} holds no camera path: {error}") from error
+            raise UserError(f"{path} is not a camera path: {error}") from error

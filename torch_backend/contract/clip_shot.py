@@ -52,8 +52,8 @@ def check_same_clip(folder: Path, clip: str | Path) -> None:
     if is_imported_from(folder, clip) is False:
         source = json_field(ShotFolder(folder).info_path, "source", SHORT_JSON)
         raise JobError(
-            f"{folder} is the shot of another clip: {source}.",
-            "Name another folder with --output, or another shot with --shot-name.",
+            f"{folder} is the shot folder of another clip: {source}.",
+            "Choose another folder with --output, or another shot with --shot-name.",
             ExitCode.USAGE,
         )
 

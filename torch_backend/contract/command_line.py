@@ -176,8 +176,9 @@ def _refuse_clip_options(args: argparse.Namespace) -> None:
         verb, it = ("is", "it") if len(lost) == 1 else ("are", "them")
         steps = [name for name in ("import", "solve", "train") if lost.keys() & _dests_of(name)]
         raise JobError(
-            f"{_listed([*lost.values()])} {verb} for a clip, and {args.clip} is a shot folder, which is frozen alone.",
-            f"Leave {it} out" + (f", or say {it} to {_listed([f'`{name}`' for name in steps])}." if steps else "."),
+            f"{_listed([*lost.values()])} {verb} for a clip, but {args.clip} is a shot folder, which only runs the "
+            "freeze.",
+            f"Leave {it} out" + (f", or pass {it} to {_listed([f'`{name}`' for name in steps])}." if steps else "."),
             ExitCode.USAGE,
         )
 
@@ -198,7 +199,7 @@ def notes(args: argparse.Namespace) -> list[str]:
     verb, explicit = VERBS[args.command], getattr(args, "explicit", {})
     found: list[str] = []
     if verb.now:
-        found.append(f"`{args.command} SHOT` is called `{verb.now} SHOT` now: the old word goes with the next version.")
+        found.append(f"`{args.command} SHOT` is now called `{verb.now} SHOT`. The next version removes the old name.")
     for cls in (verb.words, *verb.jobs.values()):
         dests = {one.name: spec.dest for one, spec in options_for(args.command, cls)}
         for one, spec in options_for(args.command, cls):
@@ -207,11 +208,11 @@ def notes(args: argparse.Namespace) -> list[str]:
             field, values = spec.effective_with
             if getattr(args, dests[field]) not in values:
                 required = _listed([f"--{field.replace('_', '-')} {value}" for value in values])
-                found.append(f"{spec.flag} is passed over: it is heeded only with {required}.")
+                found.append(f"{spec.flag} is ignored: it only works with {required}.")
     if "extend" in explicit:
         lost = [flag for dest, flag in explicit.items() if dest not in ("extend", "run", "device")]
         if lost:
-            found.append(f"{_listed(lost)}: passed over beside --extend, as a finished run keeps its settings.")
+            found.append(f"{_listed(lost)}: ignored with --extend, because a finished run keeps its settings.")
     return found
 
 

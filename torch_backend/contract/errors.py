@@ -57,7 +57,7 @@ class MissingError(UserError, FileNotFoundError):
 def unexpected(what: str, error: BaseException, log: str | Path) -> JobError:
     """JobError for a bug of Splannequin: `what` failed, and `log` has the details."""
     text = " ".join(str(error).split())[:300]
-    message = f"{what} broke: {type(error).__name__}{': ' if text else ''}{text}"
+    message = f"{what} failed: {type(error).__name__}{': ' if text else ''}{text}"
     return JobError(message, f"This is a bug; its details are in {log}.", ExitCode.INTERNAL)
 
 
@@ -68,7 +68,7 @@ def broke(what: str, error: BaseException) -> JobError:
         log.write_text("".join(traceback.format_exception(error)), encoding="utf-8", errors="backslashreplace")
     except OSError:
         traceback.print_exception(error)  # the file cannot be written, so print the details
-        return unexpected(what, error, "what stands above")
+        return unexpected(what, error, "the output above")
     return unexpected(what, error, log)
 
 
@@ -102,14 +102,14 @@ def is_disk_full(error: OSError) -> bool:
 
 _REFUSED = {
     errno.ENAMETOOLONG: ("has a name that is too long for this system", "Choose a shorter one."),
-    errno.ENOTDIR: ("leads through a file where a folder is needed", "Choose another place."),
+    errno.ENOTDIR: ("has a file where a folder is needed", "Choose another place."),
     errno.EEXIST: ("is a file where a folder is needed", "Choose another place."),
     errno.EISDIR: ("is a folder where a file is needed", "Choose another place."),
     errno.ENOENT: ("does not exist", "Check the name."),
-    errno.ELOOP: ("is a link that leads to itself", "Choose another place."),
+    errno.ELOOP: ("is a link to itself", "Choose another place."),
     **dict.fromkeys(
         (errno.EACCES, errno.EPERM, errno.EROFS),
-        ("cannot be used: it is protected, or open elsewhere", "Close it, or choose another place."),
+        ("cannot be used: it is protected, or another program has it open", "Close it, or choose another place."),
     ),
 }
 

@@ -77,7 +77,7 @@ def open_regular(path: str | Path, longest: int | None = None) -> BinaryIO:
         if not stat.S_ISREG(found.st_mode):
             raise UnreadableFile(path, "is not a file")
         if longest is not None and found.st_size > longest:
-            raise UnreadableFile(path, f"has {found.st_size / 1e9:.1f} GB, more than a file of its kind can have")
+            raise UnreadableFile(path, f"is {found.st_size / 1e9:.1f} GB, too large for this kind of file")
     except BaseException:
         source.close()
         raise
@@ -112,7 +112,7 @@ def open_arrays(path: str | Path) -> Generator[BinaryIO, None, None]:
             with zipfile.ZipFile(source) as archive:
                 packed = archive.infolist()
             if sum(part.file_size for part in packed) > LONGEST_ARRAYS:
-                raise UnreadableFile(path, "holds more than a file of its kind can")
+                raise UnreadableFile(path, "is too large for this kind of file")
             source.seek(0)
             yield source
         except UnreadableFile:
@@ -131,7 +131,7 @@ def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
         is_long = os.fstat(source.fileno()).st_size > longest
         text = b"" if is_long else source.read(longest + 1)  # the file may have grown since
     if is_long or len(text) > longest:
-        raise UserError(f"{path} is longer than {longest >> 20} MB: nothing of ours is")
+        raise UserError(f"{path} is larger than {longest >> 20} MB, more than any file of Splannequin")
     try:
         data = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:  # ValueError: invalid JSON or UTF-8, or too many digits
@@ -147,7 +147,7 @@ def is_json_object(value: object) -> TypeGuard[dict[str, Any]]:
 
 
 def _no_number(name: str) -> float:
-    raise UserError(f"{name} is no number of JSON")
+    raise UserError(f"{name} is not a JSON number")
 
 
 def read_lines(
@@ -180,7 +180,7 @@ def checked_name(name: str, what: str) -> str:
     if not _NAME.fullmatch(name) or name.endswith((".", " ")):
         raise UserError(f"{what} name {name!r} should be 1 to 64 letters, digits, spaces, '.', '_' or '-'")
     if name.partition(".")[0].rstrip().upper() in _DEVICES:
-        raise UserError(f"{what} name {name!r} is the name of a device on Windows: choose another one")
+        raise UserError(f"{what} name {name!r} is a reserved device name on Windows: choose another one")
     return name
 
 

@@ -64,7 +64,7 @@ FRAME_LAYERS = (
         ("DepthSigma.V",),
         "half",
         "DepthSigma.V",
-        "standard deviation of depth, in its units; large where nothing tells how far something is",
+        "standard deviation of the depth, in the same units; large where the depth is uncertain",
         part="sigma",
     ),
     FrameLayer(
@@ -90,8 +90,7 @@ FRAME_LAYERS = (
         ("Grain.R", "Grain.G", "Grain.B", "Grain.A"),
         "half",
         "Grain.R G B",
-        "what added to `R G B` gives the frame the plate's grain, another one on every frame; 0 where the pixel is "
-        "plate",
+        "grain to add to `R G B` to match the plate, different on every frame; 0 where the pixel comes from a plate",
         part="grain",
     ),
     FrameLayer(
@@ -99,7 +98,7 @@ FRAME_LAYERS = (
         ("Splat.R", "Splat.G", "Splat.B", "Splat.A"),
         "half",
         "Splat.R G B A",
-        "the frame of splats alone; not with `--detail off`, like the next two",
+        "the frame rendered from splats only; not with `--detail off`, like the next two",
         part="detail",
     ),
     FrameLayer(
@@ -107,10 +106,10 @@ FRAME_LAYERS = (
         ("Plate.V",),
         "half",
         "Plate.V",
-        "share of the pixel that is plate; 0: splats made it up",
+        "share of the pixel that comes from plates; 0: only from splats",
         part="detail",
         output="Plate",
-        tip="1 where the pixel is a plate's, 0 where splats made it up",
+        tip="1 where the pixel comes from plates, 0 where it comes from splats",
     ),
     FrameLayer(
         "Source",
@@ -127,11 +126,11 @@ FRAME_LAYERS = (
         ("Vector.X", "Vector.Y", "Vector.Z", "Vector.W"),
         "half",
         "Vector.X Y Z W",
-        "motion by the camera's move in pixels, y up, as Blender's Vector pass: from here to the frame before in X Y, "
-        "from the frame after to here in Z W; with `--passes`, like the next four",
+        "motion from the camera move in pixels, y up, like Blender's Vector pass: from here to the frame before in X "
+        "Y, from the frame after to here in Z W; with `--passes`, like the next four",
         part="passes",
         output="Vector",
-        tip="Motion by the camera's move in pixels of the frozen frames, for the node Vector Blur",
+        tip="Motion from the camera move in pixels of the frozen frames, for the Vector Blur node",
         socket="NodeSocketColor",  # keeps all four numbers in 4.2 to 5.2
     ),
     # Names of Nuke's layers. Blender uses Vector: 4.2 and 5.2 show sockets for two channels, but without values.
@@ -140,7 +139,7 @@ FRAME_LAYERS = (
         ("forward.u", "forward.v"),
         "half",
         "forward.u v",
-        "the same move as Nuke's built-in layer has it, in pixels, y up: from here to the frame after",
+        "the same motion as Nuke's built-in layer stores it, in pixels, y up: from here to the frame after",
         part="passes",
     ),
     FrameLayer(
@@ -148,7 +147,7 @@ FRAME_LAYERS = (
         ("backward.u", "backward.v"),
         "half",
         "backward.u v",
-        "from here to the frame before, as Nuke's built-in layer",
+        "from here to the frame before, like Nuke's built-in layer",
         part="passes",
     ),
     FrameLayer(
@@ -167,10 +166,10 @@ FRAME_LAYERS = (
         ("Position.X", "Position.Y", "Position.Z"),
         "float",
         "Position.X Y Z",
-        "place of the surface in the scene's axes and units, as the shot stood there when it was frozen",
+        "position of the surface in the scene's axes and units, with the shot's placement at the time of the freeze",
         part="passes",
         output="Position",
-        tip="Place of the surface in the scene's axes and units",
+        tip="Position of the surface in the scene's axes and units",
         socket="NodeSocketVector",
     ),
 )

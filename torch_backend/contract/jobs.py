@@ -148,9 +148,9 @@ WORK = {
     "solve": "The camera solve",
     "train": "The training",
     "freeze": "The freeze",
-    "mattes": "The job of the mattes",
-    "surface": "The job of the surface",
-    "light": "The job of the light",
+    "mattes": "The matte job",
+    "surface": "The surface job",
+    "light": "The light job",
     "combine": "The job that combines takes",
 }
 """Kind of job -> its name in messages."""
@@ -159,8 +159,8 @@ WORK = {
 def missing_shot_error(shot: Path, kind: str) -> JobError:
     """The error of a job whose shot was moved or deleted while it ran."""
     return JobError(
-        f"{WORK.get(kind, 'A step')} ended: the shot folder {shot} was moved or deleted meanwhile.",
-        "Finished work is in the folder, wherever it is now: choose it there and start again.",
+        f"{WORK.get(kind, 'A step')} stopped: the shot folder {shot} was moved or deleted in the meantime.",
+        "Finished work is still in that folder. Choose it at its new location and start again.",
         ExitCode.USAGE,
     )
 

@@ -83,7 +83,7 @@ def read_message(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
         return None
     mark, long, size = _MESSAGE.unpack(start)
     if mark != _MARK or long > _LONGEST[0] or size > _LONGEST[1]:
-        raise ValueError("the live session's stream holds something that is no message")
+        raise ValueError("the live session's stream contains data that is not a message")
     text, body = _read_exactly(stream, long), _read_exactly(stream, size)
     if text is None or body is None:
         return None

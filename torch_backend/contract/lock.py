@@ -68,5 +68,5 @@ def busy(shot: Path, writer: Writer) -> JobError:
     what, where = WORK.get(writer.kind, "A step"), printable(writer.host.partition(" (")[0], 80)
     hint, lock = "Wait for it or cancel it.", ShotFolder(shot).lock
     if writer.host != computer_name():
-        hint = f"Wait for it or cancel it there. If {where} surely works on it no longer, delete {lock}."
+        hint = f"Wait for it, or cancel it there. If {where} is certainly not working on it any more, delete {lock}."
     return JobError(f"{what} of {shot.name} has been running on {where} since {since}.", hint, ExitCode.USAGE)

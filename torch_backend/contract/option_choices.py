@@ -43,13 +43,13 @@ PLACEMENT: dict[str, Any] = {
     "flag": "--placement",
     "metavar": "FILE",
     "is_path": True,
-    "help": "JSON that says where the solve stands in the scene for which splats and cameras leave",
-    "words": "as Blender wrote it into the shot; without that upright, in solve units",
+    "help": "JSON with the placement of the solve in the scene, used to export splats and cameras",
+    "words": "as Blender wrote it into the shot; else upright, in solve units",
 }
 """Entries of the option --placement, which freezing and exporting share."""
 DEVICE: dict[str, Any] = {
     "flag": "--device",
     "choices": DEVICES,
-    "help": "where to train and freeze: `auto` takes an NVIDIA GPU",
+    "help": "device to train and freeze on: `auto` uses an NVIDIA GPU if there is one",
 }
 """Entries of the option --device, which several dataclasses share."""

@@ -67,12 +67,12 @@ class ImportParams:
         0,
         flag="--step",
         metavar="N",
-        help="solve and train on every n-th frame; all frames are delivered whatever it is",
+        help="solve and train on every n-th frame; all frames are delivered in any case",
         words="chosen",
-        limit=Limit("step between solved frames", 1, 100_000, {0: "one that is chosen"}),
+        limit=Limit("step between solved frames", 1, 100_000, {0: "an automatic step"}),
         label="Solve Every",
-        tip="Interval of the frames that are solved and trained on; all frames are delivered. 0: chosen by the clip's "
-        "length. Set a smaller one where a solve loses track; 1: every frame",
+        tip="Interval of the frames that are solved and trained on; all frames are delivered. 0: depends on the "
+        "clip's length. Use a smaller interval if the solve loses track; 1: every frame",
     )
     """Interval of the frames that are solved and trained on; 0: chosen by the clip's length. All frames are
     delivered."""
@@ -123,11 +123,11 @@ class ImportParams:
         flag="--lut",
         metavar="FILE.cube",
         is_path=True,
-        help="look of the camera, a 1D or 3D `.cube` table that makes sRGB or Rec.709 video of the footage, for logs "
-        "that no OCIO configuration has; in place of `--colour-space`",
+        help="the camera's look, a 1D or 3D `.cube` table that converts the footage to sRGB or Rec.709 video, for log "
+        "footage that no OCIO configuration covers; instead of `--colour-space`",
         words="none",
         label="Look",
-        tip="The camera's .cube table, which makes sRGB or Rec.709 video of log footage; in place of a colour space",
+        tip="The camera's .cube table, which converts log footage to sRGB or Rec.709 video; instead of a colour space",
     )
     """File of a look (.cube) through which the footage becomes display-referred; empty: none."""
     pixel_aspect: float = option(
@@ -148,11 +148,11 @@ class ImportParams:
         choices=("auto", "bt709", "bt601", "bt2020"),
         help="YCbCr matrix of a video: `auto` (what the file says, else by its size), `bt709`, `bt601`, `bt2020`",
         label="Matrix",
-        tip="How a video's YCbCr becomes RGB: greens and reds are off where it is the wrong one",
+        tip="How a video's YCbCr is converted to RGB. With the wrong matrix, greens and reds look off",
         items={
             "auto": (
                 "As Tagged",
-                "What the file says; where it says nothing, BT.709 from 1280 columns on, else BT.601",
+                "As the file states; if it does not, BT.709 from 1280 columns on, else BT.601",
             ),
             "bt709": ("BT.709", "High definition"),
             "bt601": ("BT.601", "Standard definition"),
@@ -167,9 +167,9 @@ class ImportParams:
         help="range of a video's codes: `auto` (what the file says, else video), `video` (16 to 235), "
         "`full` (0 to 255)",
         label="Levels",
-        tip="Which codes of a video are black and white: it looks washed out or crushed where they are the wrong ones",
+        tip="Which code values of a video are black and white. With the wrong levels, it looks washed out or crushed",
         items={
-            "auto": ("As Tagged", "What the file says; where it says nothing, video levels"),
+            "auto": ("As Tagged", "As the file states; if it does not, video levels"),
             "video": ("Video", "Black is 16 and white 235 of 255"),
             "full": ("Full", "Black is 0 and white 255"),
         },
@@ -208,7 +208,7 @@ class SolveParams:
         0.0,
         flag="--focal-mm",
         metavar="MM",
-        help="focal length that the lens has, for the sensor of `--sensor-mm`; the solve begins with it",
+        help="focal length of the lens, for the sensor of `--sensor-mm`; the solve starts from it",
         words="found by the solve",
         limit=Limit("focal length in mm", 1, 5000, {0: "one that the solve finds"}),
         label="Focal Length",
@@ -229,7 +229,7 @@ class SolveParams:
         True,
         flag="--hold-focal",
         switch=True,
-        help="hold the focal length of `--focal-mm` as it is; else the solve refines it",
+        help="keep the focal length of `--focal-mm` fixed; else the solve refines it",
         label="Refine",
         tip="Let the solve correct the focal length. Off: it stays as set",
     )
@@ -239,11 +239,11 @@ class SolveParams:
         flag="--st-map",
         metavar="FILE",
         is_path=True,
-        help="ST map of the lens (EXR, red s, green t): the lens is taken from it, whatever `--camera-model` says",
+        help="ST map of the lens (EXR, red s, green t): it defines the lens, and `--camera-model` is ignored",
         words="none",
         label="ST Map",
-        tip="ST map of the lens, as a lens department hands it over: the footage is undistorted through it before the "
-        "solve, and put back through it at the end. EXR of 32 bits, red s, green t; empty: the solve finds the lens",
+        tip="ST map of the lens: the footage is undistorted with it before the solve, and distorted again at the "
+        "end. 32-bit EXR, red s, green t; empty: the solve finds the lens",
     )
     """File of an ST map of the lens; empty: the solve estimates the lens."""
     st_map_way: str = option(
@@ -255,8 +255,14 @@ class SolveParams:
         label="Map",
         tip="Direction of the ST map, which its file does not state",
         items={
-            "undistort": ("Undistorts", "It takes the lens out of a plate: each of its pixels looks into the original"),
-            "redistort": ("Redistorts", "It puts the lens back into a render: its pixels look into undistorted ones"),
+            "undistort": (
+                "Undistorts",
+                "Removes the lens distortion from a plate: each pixel points into the original",
+            ),
+            "redistort": (
+                "Redistorts",
+                "Adds the lens distortion to a render: each pixel points into the undistorted picture",
+            ),
         },
     )
     """Direction of the ST map, one of `ST_MAP_WAYS`."""
@@ -264,21 +270,21 @@ class SolveParams:
         "",
         flag="--st-map-layer",
         metavar="NAME",
-        help="layer of `--st-map` that holds it",
+        help="layer of the `--st-map` file that contains the map",
         words="its red and green",
         label="Map Layer",
-        tip="Layer of the ST map's file that holds it, by its name or the end of it; empty: its red and green",
+        tip="Layer of the ST map's file that contains the map, by its name or the end of it; empty: red and green",
     )
     """Layer of the map's file; empty: its red and green."""
     retry: bool = option(
         True,
         flag="--no-retry",
         switch=True,
-        help="stop at the first solve, even where it is poor; else more features, more pairs, another lens model and "
+        help="stop after the first solve, even if it is poor; else more features, more pairs, another lens model and "
         "a global mapper are tried, each where it can help",
         label="Try Again",
-        tip="Where a solve fails or is poor, try again: with more features, more pairs of frames, another lens model, "
-        "a global mapper. Each retry is reported, and what cannot help is skipped",
+        tip="If a solve fails or is poor, try again with more features, more pairs of frames, another lens model or "
+        "a global mapper. Each retry is reported; retries that cannot help are skipped",
     )
     """Try other strategies if the solve fails or is poor."""
     ignore_mask: str = option(
@@ -286,11 +292,13 @@ class SolveParams:
         flag="--ignore-mask",
         metavar="MASK",
         parse=ignored_path,
-        help="what is not part of the scene (a logo, dirt, the crew), white: a picture for all frames, a sequence, a "
-        "video, `alpha`: where the footage is transparent, `found`: what the import found to be burnt in, or `none`",
+        help="mask of what is not part of the scene (a logo, dirt, the crew), in white: a picture for all frames, a "
+        "sequence, a video, `alpha` (where the footage is transparent), `found` (what the import detected as "
+        "burnt in) or `none`",
         label="Ignore",
-        tip="Mask of what is not part of the scene, white: a logo, dirt, the hands of the crew. It is not matched, not "
-        "learnt and not used to fill. One picture for all frames, a picture of a sequence, or a video",
+        tip="Mask of what is not part of the scene, in white: a logo, dirt, the hands of the crew. It is not "
+        "matched, not trained on and not used to fill. One picture for all frames, a picture of a sequence, or a "
+        "video",
     )
     """Mask (white) of regions to ignore: a picture, a sequence, a video, `MASK_ALPHA` or `MASK_FOUND`. Empty: none."""
     people_mask: str = option(
@@ -298,12 +306,12 @@ class SolveParams:
         flag="--people-mask",
         metavar="MASK",
         parse=mask_path,
-        help="the only places where something may move, white: as `--ignore-mask`; `alpha`: where the footage is "
-        "opaque",
+        help="mask of the only areas where something may move, in white, as for `--ignore-mask`; `alpha`: where the "
+        "footage is opaque",
         words="everywhere",
         label="People",
-        tip="Mask of what may move, white: the camera is solved from the rest, and everything outside stands still. "
-        "One picture for all frames, a picture of a sequence, or a video",
+        tip="Mask of what may move, in white: the camera is solved from the rest, and everything outside is treated "
+        "as static. One picture for all frames, a picture of a sequence, or a video",
     )
     """Mask (white) of the only regions that may move; the solve finds no features in them. Empty: everything may
     move."""
@@ -316,7 +324,7 @@ class SolveParams:
         is_path=True,
         commands=("solve",),
         help="use these cameras instead of solving: a COLMAP folder, a transforms.json or a camera path; in Blender's "
-        "command line an Alembic, FBX or USD file, too",
+        "command line also an Alembic, FBX or USD file",
         label="Cameras",
         tip="Folder of a COLMAP model or one of its files, a transforms.json, or a camera path. "
         "Pictures are matched to the clip's frames by the number in their names",
@@ -357,7 +365,7 @@ def check_params(params: object) -> None:
             raise UserError(message)
     odd = [key for key in getattr(params, "t_star_per_frame", {}) if frame_number(key) is None]
     if odd:
-        raise UserError(f"t* is given for frame {odd[0]!r}: it should be the number of a frame.")
+        raise UserError(f"t* is set for frame {odd[0]!r}, which is not a frame number.")
 
 
 def _plain(number: float) -> str:

@@ -64,5 +64,5 @@ def _rules() -> list[dict[str, Any]]:
     rows = cast("list[Any]", rules) if isinstance(rules, list) else [None]
     found = [rule for rule in rows if is_json_object(rule) and required <= set(rule)]
     if len(found) != len(rows):
-        raise UserError(f"{file} holds no path mapping rules as Open Job Description writes them")
+        raise UserError(f"{file} contains no path mapping rules in the format of Open Job Description")
     return found

@@ -136,7 +136,7 @@ def read_exr_header(file: BinaryIO) -> dict[str, bytes]:
         _text(file)  # its type
         length = struct.unpack("<i", file.read(4))[0]
         if length < 0 or length > LONGEST_LINE:
-            raise ValueError("no attribute is so long")
+            raise ValueError("an attribute is too long")
         found[name] = file.read(length)
     return found
 
@@ -146,7 +146,7 @@ def _text(file: BinaryIO) -> str:
     found = bytearray()
     while (byte := file.read(1)) != b"\0":
         if not byte or len(found) > 255:
-            raise ValueError("a name that does not end")
+            raise ValueError("a name has no end")
         found += byte
     return found.decode("latin-1")
 

@@ -53,7 +53,8 @@ class Placement:
         is_similar = all(abs(p - w) <= TOLERANCE * square for p, w in zip(products, ideal))
         if not (self.scale > 0.0 and is_similar and list(matrix[12:]) == [0.0, 0.0, 0.0, 1.0]):
             raise UserError(
-                "The placement's scene_from_solve should turn, scale evenly and move: it mirrors, shears or flattens."
+                "The placement's scene_from_solve should only rotate, scale uniformly and move, but it mirrors, "
+                "shears or flattens."
             )
         if not (math.isfinite(self.metres_per_unit) and self.metres_per_unit > 0.0):
             raise UserError(f"The placement's metres_per_unit is {self.metres_per_unit}: it should be above 0.")
@@ -82,7 +83,7 @@ class Placement:
         try:
             return Placement.from_json(data)
         except ValueError as error:
-            raise UserError(f"{path} holds no placement: {error}") from error
+            raise UserError(f"{path} is not a placement: {error}") from error
 
 
 def placement_of(facts: Mapping[str, Any]) -> Placement:

@@ -240,13 +240,13 @@ class ShotFolder:
             path = path / part
             if is_link(path):
                 raise JobError(
-                    f"{path} is a link to {os.path.realpath(path)}: what lies there is not this shot's to change.",
+                    f"{path} is a link to {os.path.realpath(path)}. This shot must not change files there.",
                     "Remove the link, or put a folder of that name in its place, then start again.",
                     ExitCode.USAGE,
                 )
             if os.path.lexists(path) and not path.is_dir():
                 raise JobError(
-                    f"{path} is not a folder.", "Move it away: the shot keeps its files there.", ExitCode.USAGE
+                    f"{path} is not a folder.", "Move it somewhere else: the shot needs a folder there.", ExitCode.USAGE
                 )
         return folder
 

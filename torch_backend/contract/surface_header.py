@@ -69,10 +69,10 @@ def read_surface_header(handle: BinaryIO, path: str | Path) -> SurfaceHeader:
     text = (start[0] + start[1]).decode("ascii", errors="replace")
     found = re.fullmatch(re.escape(_TEXT).replace(r"\{\}", r"(\w{1,100})"), text)
     if found is None or not (found[2].isdecimal() and found[3].isdecimal()) or len(found[2] + found[3]) > 20:
-        raise UserError(f"{path} is no surface of a take: make it again.")
+        raise UserError(f"{path} is not the surface of a take: create it again.")
     header = SurfaceHeader(found[1], int(found[2]), int(found[3]))
     size = handle.seek(0, 2) - len(text)
     if size != header.vertices * _VERTEX_BYTES + header.triangles * _TRIANGLE_BYTES:
-        raise UserError(f"{path} is cut short: make it again.")
+        raise UserError(f"{path} is truncated: create it again.")
     handle.seek(len(text))
     return header

@@ -21,7 +21,7 @@ class FreezeParams:
         metavar="NAME",
         help="name of the take",
         label="Take",
-        tip="Name of the frozen frames; a new name keeps the old",
+        tip="Name of the frozen frames; with a new name, earlier ones are kept",
     )
     """Name of the take's folder in takes/."""
     t_star: int | None = option(
@@ -32,8 +32,8 @@ class FreezeParams:
         words="suggested from support and sharpness",
         limit=Limit("t*", -FRAMES, FRAMES),
         label="t*",
-        tip="Frame number of the clip at which time stands still. Keyed, it is followed frame by frame: "
-        "freeze, hold and release",
+        tip="Frame number of the clip at which time stands still. Keyframes are followed frame by frame: freeze, "
+        "hold and release",
     )
     """Frame number of the clip at which time stands still; None: suggested from support and sharpness."""
     t_star_per_frame: dict[str, float] = field(
@@ -70,30 +70,29 @@ class FreezeParams:
         words="the source's own",
         limit=Limit("width of the frozen frames", 16, 16_384, {0: "the source's"}),
         label="Width",
-        tip="Width in pixels of the frozen frames; 0: the source's own, or as the scene renders from a camera "
-        "of your own",
+        tip="Width in pixels of the frozen frames; 0: as the source, or with another camera as the scene renders",
     )
     """Width in pixels of the frozen frames; 0: the source's own."""
     detail: str = option(
         "on",
         flag="--detail",
         choices=SWITCH,
-        help="`on`: frozen frames are made of the plates, where they can be believed; `off`: of the splats alone",
+        help="`on`: frozen frames use plate pixels where these are reliable; `off`: only splats",
         label="Detail",
-        tip="Make frozen frames of the plates, where they can be believed: as sharp as the plate. "
-        "Off: of the splats alone, soft throughout",
+        tip="Build frozen frames from plate pixels where these are reliable, as sharp as the plate. Off: from splats "
+        "only, softer throughout",
     )
     """on: frozen frames are made of the plates where these are reliable; off: of the splats alone."""
     develop: str = option(
         "on",
         flag="--develop",
         choices=SWITCH,
-        help="`on`: before it is rendered, the scene at t* is trained on as a still one, once for each t*, which "
-        "brings back what the run lost; motion that makes other frames worse is held still. `off`: as the run has it",
+        help="`on`: before rendering, train the scene at t* as a static one, once for each t*; this recovers what the "
+        "run lost, and freezes motion that makes other frames worse. `off`: use the run unchanged",
         label="Develop",
-        tip="Train the frozen instant on as the still scene that it is, before it is rendered: what moves is "
-        "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each "
-        "t*. Off: the instant as the training left it",
+        tip="Train the frozen instant further as a static scene before rendering: movers match the plate at t*, and "
+        "static parts are sharper. Takes up to a few minutes, once for each t*. Off: use the training's result "
+        "unchanged",
     )
     """on: the instant is trained further as a static scene, and stored with the run; off: it is rendered as the run has
     it. At most six keyed instants are developed."""
@@ -102,7 +101,7 @@ class FreezeParams:
         flag="--overscan",
         metavar="PERCENT",
         parse=overscan,
-        help="picture beyond the frame on every side, or `lens`: as much as the way back through the lens needs",
+        help="extra picture on every side, or `lens`: as much as adding the lens distortion back needs",
         limit=Limit("overscan in percent", 0, 100, {-1: "what the lens needs"}),
     )
     """Extra picture beyond the frame on every side, in percent of its width and height; -1: as much as redistortion
@@ -119,10 +118,10 @@ class FreezeParams:
         False,
         flag="--passes",
         switch=True,
-        help="motion vectors, normals and positions as layers of the frames",
+        help="motion vectors, normals and positions as additional layers of the frames",
         label="Passes",
-        tip="Write motion vectors of the camera's move (Blender's Vector layout), normals and positions as further "
-        "layers of the frames, in the scene's axes and units",
+        tip="Write motion vectors of the camera move (in Blender's Vector layout), normals and positions as "
+        "additional layers of the frames, in the scene's axes and units",
     )
     """Write the layers of `FRAME_LAYERS` whose part is passes."""
     deep: bool = option(
@@ -132,16 +131,16 @@ class FreezeParams:
         help="also a deep EXR for each frame, for Nuke, Fusion and Houdini: two samples where two surfaces meet in a "
         "pixel",
         label="Deep EXR",
-        tip="Write a deep EXR beside each frame, with two samples where two surfaces meet in a pixel, for deep "
-        "compositing in Nuke, Fusion or Houdini. Blender reads none. Not with Motion Blur",
+        tip="Write a deep EXR with each frame, with two samples where two surfaces meet in a pixel, for deep "
+        "compositing in Nuke, Fusion or Houdini. Blender cannot read deep EXRs. Not with Motion Blur",
     )
     """Write takes/NAME/deep/NNNNNN.exr: the frame as deep samples in the scene's units."""
     shutter: float = option(
         0.0,
         flag="--shutter",
         metavar="DEGREES",
-        help="motion blur by the move of a camera path of your own: degrees of 360 that the shutter is open, as a film "
-        "camera's 180; a frame takes as many times as long as its blur is pixels long, 33 times at most",
+        help="motion blur from the move of your own camera path: shutter angle in degrees, 180 for a typical film "
+        "camera; render time grows with the length of the blur in pixels, at most 33 times",
         limit=Limit("shutter in degrees", 0, 360),
     )
     """Motion blur from the motion of `camera_path`: shutter angle in degrees, centred on each frame; 0: none."""
@@ -151,8 +150,8 @@ class FreezeParams:
         metavar="DIR",
         is_path=True,
         words="not written",
-        help="for developers: write what decided where each pixel comes from into DIR, an EXR of named channels for "
-        "each frame; every frame is rendered anew",
+        help="for developers: write the data that decided the source of each pixel into DIR, one EXR with named "
+        "channels per frame; all frames are rendered again",
     )
     """Folder for the terms behind each frame's decisions (`torch_backend/freeze/take/debug_terms.py`); empty: none."""
     device: str = option("auto", **DEVICE)
@@ -181,10 +180,10 @@ class MatteParams:
         "exr",
         flag="--matte-format",
         choices=MATTE_FORMATS,
-        help="files of the single mattes: `exr` (half floats) or `png` (16 bits)",
+        help="file format of the separate mattes: `exr` (half floats) or `png` (16 bits)",
     )
     """File format of the single mattes: exr or png."""
-    device: str = option("auto", **{**DEVICE, "help": "where to render: `auto` takes an NVIDIA GPU"})
+    device: str = option("auto", **{**DEVICE, "help": "device to render on: `auto` uses an NVIDIA GPU if there is one"})
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
 
@@ -196,7 +195,7 @@ LIVE_SOURCE = "live"
 class CombineParams:
     """Parameters of a take combined from several takes: each thing under a matte comes from a chosen take."""
 
-    take: str = option("combined", flag="--take", metavar="NAME", help="name of the take that is made")
+    take: str = option("combined", flag="--take", metavar="NAME", help="name of the new take")
     """Name of the new take's folder in takes/."""
     base: str = option("freeze", flag="--base", metavar="TAKE", help="take that shows everything else")
     """Name of the take that shows everything outside the mattes."""
@@ -204,8 +203,8 @@ class CombineParams:
         "",
         flag="--things",
         metavar="MATTE=TAKE,...",
-        help="which thing comes from which take; both takes must have the matte. `MATTE=live`: it goes on living, as "
-        "the clip has it",
+        help="which thing comes from which take; both takes must have the matte. `MATTE=live`: the thing keeps moving "
+        "as in the clip",
         words="none",
     )
     """Pairs MATTE=TAKE, separated by commas. `LIVE_SOURCE` in place of a take stands for the clip itself."""
@@ -230,15 +229,15 @@ class LightParams:
         flag="--position",
         metavar="X,Y,Z",
         parse=point_text,
-        help="point that the light falls on, in the axes and units of Blender's scene; with an equals sign where it "
-        "begins with a minus: `--position=-1,2,0.5`",
+        help="point at which to compute the light, in the axes and units of Blender's scene; use an equals sign if it "
+        "starts with a minus: `--position=-1,2,0.5`",
     )
     """Three numbers, separated by commas: the point, in the axes and units of Blender's scene."""
     placement: str = option(
         "",
         **{
             **PLACEMENT,
-            "help": "JSON that says where the solve stands in the scene whose axes and units `--position` has",
+            "help": "JSON with the placement of the solve in the scene that `--position` refers to",
         },
     )
     """JSON file of a `Placement`; empty: the shot's own, else upright, in solve units."""

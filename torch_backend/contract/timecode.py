@@ -27,7 +27,7 @@ def later(timecode: str, frames: int, fps: float) -> str:
     found = _TEXT.fullmatch(timecode)
     rate = round(fps)
     if found is None or rate < 1:
-        raise UserError(f"this is no timecode of {fps:g} frames per second: {timecode!r}")
+        raise UserError(f"this is not a timecode at {fps:g} frames per second: {timecode!r}")
     hours, minutes, seconds, number = (int(found[i]) for i in (1, 2, 3, 5))
     drop = rate // 15 if found[4] != ":" and rate % 30 == 0 else 0
     total = 60 * hours + minutes
@@ -46,7 +46,7 @@ def smpte_bits(timecode: str) -> tuple[int, int]:
     """Two words that OpenEXR and DPX store for a timecode: binary-coded decimals; bit 6 of the first is drop frame."""
     found = _TEXT.fullmatch(timecode)
     if found is None or int(found[5]) > 39:  # the tens of frames have two bits
-        raise UserError(f"this is no timecode that a picture can hold: {timecode!r}")
+        raise UserError(f"this timecode cannot be stored in a picture: {timecode!r}")
     fields = [int(found[i]) for i in (5, 3, 2, 1)]
     word = sum((value // 10 << 4 | value % 10) << 8 * i for i, value in enumerate(fields))
     return word | (0 if found[4] == ":" else 1 << 6), 0

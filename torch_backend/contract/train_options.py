@@ -18,7 +18,7 @@ class TrainParams:
         metavar="NAME",
         help="name of the run",
         label="Run",
-        tip="Name of the training run; a new name keeps the old",
+        tip="Name of the training run; with a new name, earlier runs are kept",
     )
     """Name of the run's folder in runs/."""
     preset: str = option(
@@ -29,12 +29,12 @@ class TrainParams:
         label="Preset",
         tip="How much to spend on training",
         items={
-            "preview": ("Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
-            "standard": ("Standard", "960 pixels wide, 9000 steps: for what moves, and what no plate shows"),
+            "preview": ("Preview", "320 pixels wide, 2000 steps: a quick check of the shot, minutes on a laptop"),
+            "standard": ("Standard", "960 pixels wide, 9000 steps: good for movers and for areas that no plate shows"),
             "final": (
                 "Final",
-                "As wide as the working frames, 30000 steps, most Gaussians: takes longest. On a graphics card as "
-                "wide as the source, up to 1920 pixels, with up to a million Gaussians",
+                "As wide as the working frames, 30000 steps, most Gaussians: takes longest. On a graphics card, as "
+                "wide as the source up to 1920 pixels, with up to a million Gaussians",
             ),
         },
     )
@@ -67,7 +67,7 @@ class TrainParams:
         "support",
         flag="--supervision",
         choices=SUPERVISIONS,
-        help="what anchors Gaussians at times at which no frame shows them: `support` (ours), `paper` (the paper's "
+        help="how Gaussians are anchored at times when no frame shows them: `support` (ours), `paper` (the paper's "
         "rule), `none`",
     )
     """Which losses anchor ill-supervised Gaussians: support, paper or none."""
@@ -111,7 +111,7 @@ class TrainParams:
         -1,
         flag="--holdout",
         metavar="N",
-        help="keep every n-th frame out of training to measure on; 0: none",
+        help="hold out every n-th frame from the training, to measure quality; 0: none",
         words="`preview` 8, others none",
         limit=Limit("distance between held-out frames", 2, 1_000_000, {0: "none", -1: "the preset's"}),
     )
@@ -123,16 +123,18 @@ class TrainParams:
         flag="--depth",
         metavar="FOLDER",
         is_path=True,
-        help="depth maps of the clip's frames, of a phone's sensor or a network: a folder of EXR, 16-bit PNG or TIFF, "
-        "numbered as the frames; metric, inverse or relative. They give the depth of what moves",
+        help="depth maps of the clip's frames, from a phone's sensor or a network: a folder of EXR, 16-bit PNG or "
+        "TIFF, numbered like the frames; metric, inverse or relative. They give the depth of movers",
         words="none",
         label="Depth",
-        tip="Depth maps of the clip's frames, of a phone's sensor or a network: a folder of EXR, 16-bit PNG or TIFF, "
-        "numbered as the frames. Scale and shift are fitted. They give the depth of movers, in the training and in "
-        "frozen frames; empty: none",
+        tip="Depth maps of the clip's frames, from a phone's sensor or a network: a folder of EXR, 16-bit PNG or "
+        "TIFF, numbered like the frames. Scale and shift are fitted. They give the depth of movers, in the "
+        "training and in frozen frames; empty: none",
     )
     """Depth maps of the frames: a folder, one of its files or a pattern; metric, inverse or relative. Empty: none."""
-    resume: bool = option(True, flag="--restart", switch=True, help="do not go on from the run's checkpoint")
+    resume: bool = option(
+        True, flag="--restart", switch=True, help="start from scratch instead of the run's checkpoint"
+    )
     """Resume from the run's checkpoint if there is one."""
     device: str = option("auto", **DEVICE)
     """cpu, cuda, or auto: the NVIDIA GPU if there is a usable one. A run may resume on another device."""
@@ -145,6 +147,6 @@ class TrainParams:
         words="none",
         limit=Limit("number of steps to add", 1, 10_000_000, {0: "none"}),
         label="More Steps",
-        tip="How many steps Train On adds to a finished run; a third of the preset's at first",
+        tip="How many steps Train On adds to a finished run; a third of the preset's by default",
     )
     """Steps to add to a finished run, which keeps its settings; 0: none."""

@@ -40,8 +40,8 @@ def refuse_foreign(folder: Path) -> None:
     if INFO_FILE not in names and foreign:
         named = foreign[0] if len(foreign) == 1 else f"{foreign[0]} and {len(foreign) - 1} more"
         raise JobError(
-            f"{folder} is no shot folder, and holds other files ({named}).",
-            "Choose a folder that is empty or not there yet: the shot would lie among them.",
+            f"{folder} is not a shot folder and contains other files ({named}).",
+            "Choose an empty or new folder, so that the shot's files stay separate.",
             ExitCode.USAGE,
         )
 

@@ -43,7 +43,7 @@ class ShotWords:
 class NewShotWords:
     """The shot to create."""
 
-    shot: str = option("", flag="shot", help="shot folder, made if it is not there")
+    shot: str = option("", flag="shot", help="shot folder; created if it does not exist")
     """Shot folder."""
 
 
@@ -51,7 +51,7 @@ class NewShotWords:
 class WholeWords:
     """Where to write the results of all steps from a clip."""
 
-    output: str = option("output", flag="--output", metavar="DIR", help="folder for everything that comes out")
+    output: str = option("output", flag="--output", metavar="DIR", help="output folder")
     """Folder for the shot and summary.json."""
     shot_name: str = option("shot", flag="--shot-name", metavar="NAME", help="name of the shot folder inside it")
     """Name of the shot folder in `output`."""
@@ -67,7 +67,7 @@ class BakeWords:
     """Shot folder."""
     take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
     """Name of the take."""
-    output: str = option("", flag="--output", metavar="DIR", required=True, help="folder for what comes out")
+    output: str = option("", flag="--output", metavar="DIR", required=True, help="output folder")
     """Folder for composited/, shot.blend and summary.json."""
     first: int | None = option(
         None, flag="--first", metavar="N", help="first frame to bake", words="the take's, or the .blend's range"
@@ -83,7 +83,9 @@ class BakeWords:
     """Last frame to bake, inclusive; None: the scene's."""
     step: int = option(0, flag="--step", metavar="N", help="bake every n-th frame", words="the scene's step")
     """Interval of the frames to bake; 0: the scene's step."""
-    device: str = option("auto", **{**DEVICE, "help": "where to freeze what is missing: `auto` takes an NVIDIA GPU"})
+    device: str = option(
+        "auto", **{**DEVICE, "help": "device to freeze missing frames on: `auto` uses an NVIDIA GPU if there is one"}
+    )
     """Device on which missing frames of the take are frozen."""
     blend: str = option("", flag="--blend", help=".blend to insert the freeze into", words="a new scene")
     """.blend to insert the freeze into; empty: a new scene."""
@@ -91,15 +93,15 @@ class BakeWords:
         "all",
         flag="--part",
         choices=("all", "frames", "file"),
-        help="`all`; for several computers at once: `frames` (the pictures alone, each renamed into its place whole), "
-        "then once `file` (shot.blend and summary.json alone)",
+        help="`all`; with several computers at once, first `frames` (only the pictures, each renamed into place when "
+        "complete), then `file` once (only shot.blend and summary.json)",
     )
     """all; frames: only the pictures; file: only shot.blend and summary.json."""
     as_warp: bool = option(
         False,
         flag="--as-warp",
         switch=True,
-        help="freeze the plate that the .blend shows by the take's warp, instead of showing the take's frames",
+        help="freeze the plate of the .blend with the take's warp, instead of showing the take's frames",
     )
     """Freeze the plate that the .blend shows with the take's warp."""
 
@@ -161,7 +163,7 @@ class DoctorWords:
         False,
         flag="--gpu",
         switch=True,
-        help="test the graphics card anew: a small frame and its gradients against the processor's",
+        help="test the graphics card again: compare a small frame and its gradients with the processor's",
     )
     """Test the graphics card again."""
 
@@ -174,7 +176,7 @@ class LiveWords:
     """Shot folder."""
     run: str = option("main", flag="--run", metavar="NAME", help="name of the run")
     """Name of the run."""
-    device: str = option("auto", **{**DEVICE, "help": "where to draw: `auto` takes an NVIDIA GPU"})
+    device: str = option("auto", **{**DEVICE, "help": "device to render on: `auto` uses an NVIDIA GPU if there is one"})
     """Device to draw on."""
 
 
@@ -190,7 +192,7 @@ class FarmWords:
         many=True,
         is_path=True,
         metavar="SHOT",
-        help="shot folders; or clips, of which shots are made on the farm",
+        help="shot folders, or clips whose shots are created on the farm",
     )
     """Shot folders, or clips."""
     output: str = option(
@@ -201,7 +203,7 @@ class FarmWords:
         None,
         flag="--t-star",
         metavar="N,N",
-        help="frames at which time stands still, each a take of its own",
+        help="frames at which time stands still; each becomes a separate take",
         words="one, suggested from support and sharpness",
     )
     """Instants of every shot, separated by commas; None: one suggested instant."""
@@ -210,11 +212,11 @@ class FarmWords:
         flag="--t-star-list",
         is_path=True,
         metavar="FILE",
-        help="text with a line for each shot: its name, and its instants",
+        help="text file with a line for each shot: its name and its instants",
         words="the same for all",
     )
     """File with a line per shot: NAME N N N."""
-    frames: int = option(10, flag="--frames", metavar="N", help="frames of a task of freeze and bake")
+    frames: int = option(10, flag="--frames", metavar="N", help="frames per task of freeze and bake")
     """Frames of one task."""
     bake: bool = option(
         False, flag="--bake", switch=True, help="through Blender's compositor, too: OUTPUT_FOLDER/SHOT/TAKE/composited"
@@ -225,18 +227,18 @@ class FarmWords:
         flag="--shots-folder",
         is_path=True,
         metavar="DIR",
-        help="where shots of clips are made",
-        words="beside each clip",
+        help="folder for the shots of clips",
+        words="next to each clip",
     )
     """Folder for the shots of clips; empty: next to each clip."""
-    shots_per_job: int = option(15, flag="--shots-per-job", metavar="N", help="shots of one template, at most")
+    shots_per_job: int = option(15, flag="--shots-per-job", metavar="N", help="maximum number of shots in one template")
     """Largest number of shots in one template. Farms limit the length of a template."""
     request: str = option(
         "",
         flag="--request",
         is_path=True,
         metavar="FILE",
-        help="parameters of the steps as JSON, {step: {name: value}}, in the place of options",
+        help="parameters of the steps as JSON, {step: {name: value}}, instead of options",
         words="the options",
     )
     """JSON file of parameters, which override the options."""
@@ -253,7 +255,7 @@ class FarmWords:
         0,
         flag="--session-tasks",
         metavar="N",
-        help="for the estimate: tasks of a step that a host does before it enters the job's environment again",
+        help="for the estimate: tasks of a step that a host runs before it enters the job's environment again",
         words="all that it does of one",
     )
     """Tasks per session of the farm's engine; 0: all tasks of a step that a host does."""
@@ -267,7 +269,7 @@ class TaskWords:
         "",
         flag="step",
         choices=("import", "solve", "train", "open", "freeze", "finish", "bake", "deliver"),
-        help="what is to be done",
+        help="what to do",
     )
     """Step of the template."""
     shot: str = option("", flag="--shot", metavar="SHOT", required=True, help="shot folder")
@@ -310,59 +312,63 @@ class Verb:
 
 INPUT = (
     "INPUT",
-    "video file, image sequence or pattern (shot.####.exr); or a shot folder, which is frozen alone",
+    "video file, image sequence or pattern (shot.####.exr); or a shot folder, which only runs the freeze",
 )
 """Metavar and help of the input of `freeze`."""
 VERBS: dict[str, Verb] = {
-    "import": Verb("footage into a shot folder", NewShotWords, {"import": ImportParams}),
-    "solve": Verb("cameras of a shot", ShotWords, {"solve": SolveParams}),
-    "train": Verb("a run of a shot: Gaussians, and what of them moves", ShotWords, {"train": TrainParams}),
+    "import": Verb("import footage into a shot folder", NewShotWords, {"import": ImportParams}),
+    "solve": Verb("solve the cameras of a shot", ShotWords, {"solve": SolveParams}),
+    "train": Verb("train a run of a shot: Gaussians and their motion", ShotWords, {"train": TrainParams}),
     "freeze": Verb(
-        "frozen frames of a shot; of a clip, all that is missing first: import, solve, train",
+        "render the frozen frames of a shot; for a clip, run the missing steps first: import, solve, train",
         WholeWords,
         STEP_PARAMS,
         shown={
             "source": INPUT,
-            "first": ("N", "first frame number of the clip; of a shot folder, first frame that is frozen"),
-            "last": ("N", "last frame number, inclusive; of a shot folder, last frame that is frozen"),
+            "first": ("N", "first frame number of the clip; for a shot folder, first frame to freeze"),
+            "last": ("N", "last frame number, inclusive; for a shot folder, last frame to freeze"),
             "step": (
                 "N",
-                "solve and train on every n-th frame; all frames are delivered whatever it is. Of a shot folder, "
+                "solve and train on every n-th frame; all frames are delivered in any case. For a shot folder, "
                 "freeze every n-th frame from the first",
             ),
         },
     ),
     "take": Verb("`freeze SHOT`", ShotWords, {"freeze": FreezeParams}, (BACKEND,), now="freeze"),
     "mattes": Verb(
-        "mattes of things in a take, each lassoed at one frame: single sequences and a Cryptomatte",
+        "make mattes of things in a take, each lassoed at one frame: separate sequences and a Cryptomatte",
         ShotWords,
         {"mattes": MatteParams},
     ),
     "combine": Verb(
-        "one take of several: each thing under a matte from a take of its own, or living on",
+        "combine takes: each thing with a matte comes from its own take, or keeps moving",
         ShotWords,
         {"combine": CombineParams},
     ),
     "surface": Verb(
-        "the frozen scene of a take as a mesh, to catch shadows and to hide what is behind it",
+        "write the frozen scene of a take as a mesh that catches shadows and hides what is behind it",
         ShotWords,
         {"surface": SurfaceParams},
     ),
     "light": Verb(
-        "the light of a take's frozen scene at a point, as a panorama for Blender's world",
+        "write the light of a take's frozen scene at a point, as a panorama for Blender's world",
         ShotWords,
         {"light": LightParams},
     ),
-    "bake": Verb("a take through the compositor: DIR/composited and DIR/shot.blend", BakeWords, sides=(BLENDER,)),
-    "stmaps": Verb("ST maps of the lens, both ways, into the shot's solve folder", MapWords),
-    "export": Verb("cameras, points and splats of a shot for other programs", ExportWords),
-    "status": Verb("jobs of a shot", ShotWords),
-    "farm": Verb("a job for a render farm, as Open Job Description, and what it will cost", FarmWords, STEP_PARAMS),
-    "farm-task": Verb("one task of such a job (what the farm starts)", TaskWords, sides=(BACKEND,), json=False),
-    "doctor": Verb("what this environment can do, as JSON", DoctorWords, json=False),
-    "run-job": Verb("the job in a folder (what Blender starts)", JobWords, sides=(BACKEND,)),
+    "bake": Verb(
+        "render a take through the compositor: DIR/composited and DIR/shot.blend", BakeWords, sides=(BLENDER,)
+    ),
+    "stmaps": Verb("write ST maps of the lens, in both directions, into the shot's solve folder", MapWords),
+    "export": Verb("export cameras, points and splats of a shot for other programs", ExportWords),
+    "status": Verb("list the jobs of a shot", ShotWords),
+    "farm": Verb(
+        "write a job for a render farm, as Open Job Description, and estimate its cost", FarmWords, STEP_PARAMS
+    ),
+    "farm-task": Verb("run one task of such a job (started by the farm)", TaskWords, sides=(BACKEND,), json=False),
+    "doctor": Verb("print what this environment can do, as JSON", DoctorWords, json=False),
+    "run-job": Verb("run the job in a folder (started by Blender)", JobWords, sides=(BACKEND,)),
     "live": Verb(
-        "frozen views as they are asked for on standard input (for Blender)", LiveWords, sides=(BACKEND,), json=False
+        "render frozen views on request from standard input (for Blender)", LiveWords, sides=(BACKEND,), json=False
     ),
 }
 """Every verb, in the order of --help."""

@@ -98,16 +98,21 @@ def needs(rates: dict[str, Rate], card: bool, megapixels: float) -> dict[str, Ne
 
 def sentences(costs: Estimate, rates_from: str) -> list[str]:
     """Text of an estimate, line by line."""
-    lines = [f"{costs.shots} shots, {costs.tasks} tasks. By rates {rates_from}, on hosts that do one task at a time:"]
+    lines = [
+        f"{costs.shots} shots, {costs.tasks} tasks. Estimated from rates {rates_from}, on hosts that run one task at a "
+        "time:"
+    ]
     for row in costs.rows:
         of = "sessions" if row.kind == ENGINE else "tasks"
         lines.append(f"  {row.kind:<8} {row.tasks:>6} {of:<8} {_hours(row.seconds):>10}")
     lines.append(f"Processor: {costs.core_hours:.2f} core-hours.")
     if costs.card_hours:
-        lines.append(f"Card: {costs.card_hours:.2f} card-hours, if a card is no faster than the rates say.")
+        lines.append(f"Card: {costs.card_hours:.2f} card-hours, if the card is as fast as in the rates.")
     lines.append(f"Disk: up to {costs.disk_gb:.1f} GB.")
     ends = ", ".join(f"{hosts} {_hours(seconds)}" for hosts, seconds in costs.on_hosts.items())
-    lines.append(f"Until the last task ends, by hosts: {ends}; never under {_hours(costs.critical_seconds)}.")
+    lines.append(
+        f"Time until the last task ends, by number of hosts: {ends}; at least {_hours(costs.critical_seconds)}."
+    )
     return lines
 
 

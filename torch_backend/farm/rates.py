@@ -95,12 +95,12 @@ def read_rates(path: str | Path) -> dict[str, Rate]:
     try:
         record = read_json(path)
         if record.get("version") != VERSION:
-            raise ValueError("it is not of this version")
+            raise ValueError("it was written by another version")
         overrides = {str(step): from_dict(Rate, rate) for step, rate in dict(record["rates"]).items()}
         if set(overrides) - set(MEASURED):
-            raise ValueError(f"it names the step {sorted(set(overrides) - set(MEASURED))[0]}")
+            raise ValueError(f"it contains the unknown step {sorted(set(overrides) - set(MEASURED))[0]}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise JobError(
-            f"{path} holds no rates: {error}.", "Give the rates.json of `farm measure`.", ExitCode.USAGE
+            f"{path} is not a file of rates: {error}.", "Use the rates.json of `farm measure`.", ExitCode.USAGE
         ) from error
     return MEASURED | overrides

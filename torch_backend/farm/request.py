@@ -16,9 +16,9 @@ def read_request(path: str | Path) -> dict[str, Any]:
     try:
         data = read_json(path, SHORT_JSON)
         if data.get("version") != VERSION:
-            raise ValueError("it is not of this version")
+            raise ValueError("it was written by another version")
     except (OSError, ValueError) as error:
-        raise JobError(f"{path} is no request of a farm's template: {error}.", "", ExitCode.USAGE) from error
+        raise JobError(f"{path} is not a request of a farm template: {error}.", "", ExitCode.USAGE) from error
     return data
 
 

@@ -146,7 +146,7 @@ class _Names:
         lost = sorted(set(self._table) - self._found)
         if lost:
             raise JobError(
-                f"The list of instants names {lost[0]}, which is none of the shots.",
+                f"The list of instants names {lost[0]}, which is not one of the shots.",
                 f"The shots are {', '.join(sorted(shot.name for shot in shots)[:10])}.",
                 ExitCode.USAGE,
             )
@@ -199,7 +199,7 @@ def _of_shot(path: str, requests: dict[str, Any]) -> FarmShot:
         width, height = record.get("source_size") or working
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise JobError(
-            f"{folder.root} holds no imported clip ({error}).", "Import the clip first, or name the clip itself.",
+            f"{folder.root} contains no imported clip ({error}).", "Import the clip first, or pass the clip itself.",
             ExitCode.USAGE,
         ) from error  # fmt: skip
     fields = {kind: dataclasses.asdict(params) for kind, params in requests.items() if kind != "import"}
@@ -226,7 +226,9 @@ def _of_clip(path: str, requests: dict[str, Any], shots_folder: str) -> FarmShot
     shift = shift_of(opened.info, import_params)
     info = renumbered(opened, shift).info
     if info.last is None:
-        raise JobError(f"{clip} does not say how many frames it has.", "Import it, and name the shot.", ExitCode.USAGE)
+        raise JobError(
+            f"{clip} does not say how many frames it has.", "Import it, and pass the shot folder.", ExitCode.USAGE
+        )
     first = info.first if import_params.first is None else max(info.first, import_params.first + shift)
     last = info.last if import_params.last is None else min(info.last, import_params.last + shift)
     identity = os.path.abspath(info.file or clip)
@@ -235,7 +237,7 @@ def _of_clip(path: str, requests: dict[str, Any], shots_folder: str) -> FarmShot
     fields = {kind: dataclasses.asdict(params) for kind, params in requests.items()}
     fields["import"]["source"] = clip
     if fields["freeze"]["camera_path"]:
-        raise JobError("A camera path is for a shot that is solved.", "Name the shot folder.", ExitCode.USAGE)
+        raise JobError("A camera path needs a solved shot.", "Pass the shot folder.", ExitCode.USAGE)
     return FarmShot(
         "", called, identity, "", _root_of(clip, called, identity, shots_folder), clip, first, last,
         working, (info.width, info.height), {}, fields, False, False,
@@ -309,12 +311,12 @@ def read_requests(path: str, requests: dict[str, Any]) -> dict[str, Any]:
             record = read_json(path)
             for kind, values in record.items():
                 if kind not in STEP_PARAMS or not is_json_object(values):
-                    raise ValueError(f"{kind!r} is none of {', '.join(STEP_PARAMS)}")
+                    raise ValueError(f"{kind!r} is not one of {', '.join(STEP_PARAMS)}")
                 requests[kind] = from_dict(STEP_PARAMS[kind], {**dataclasses.asdict(requests[kind]), **values})
                 for field, spec in options_of(STEP_PARAMS[kind]):
                     value: Any = getattr(requests[kind], field.name)
                     if spec.choices and value not in (*spec.choices, field.default):
-                        raise ValueError(f"{field.name} is {value!r}, none of {', '.join(spec.choices)}")
+                        raise ValueError(f"{field.name} is {value!r}, which is not one of {', '.join(spec.choices)}")
         except (OSError, ValueError) as error:
             raise JobError(f"{path} cannot be used as parameters: {error}.", "", ExitCode.USAGE) from error
     for params in requests.values():
@@ -327,7 +329,7 @@ def parse_instants(text: str) -> list[int]:
     try:
         return [int(word) for word in re.split(r"[\s,]+", text.strip()) if word]
     except ValueError:
-        message = f"{text!r} are no instants."
+        message = f"{text!r} is not a list of instants."
         raise JobError(message, "Give frame numbers with commas, such as 34,60.", ExitCode.USAGE) from None
 
 

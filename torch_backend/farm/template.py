@@ -31,14 +31,14 @@ MOST_LETTERS = 1024
 NOTIFY_SECONDS = 60
 """Seconds that a cancelled training has for its checkpoint."""
 _DESCRIPTIONS = {
-    "import": "Footage into the shot folder",
-    "solve": "Cameras, and what moves",
-    "train": "Gaussians, and what of them moves",
-    "open": "The instant is chosen and developed: what all parts of a take share",
-    "freeze": "Frozen frames, a part of a take in each task",
-    "finish": "Contact sheet, video, PLY and take.json of the whole take",
-    "bake": "Frames through Blender's compositor, a part of a take in each task",
-    "deliver": "shot.blend and summary.json of what is baked",
+    "import": "Imports the footage into the shot folder",
+    "solve": "Solves the cameras and finds what moves",
+    "train": "Trains Gaussians and their motion",
+    "open": "Chooses and develops the instant, which all parts of a take share",
+    "freeze": "Freezes frames, one part of a take per task",
+    "finish": "Writes the contact sheet, video, PLY and take.json of the whole take",
+    "bake": "Renders frames through Blender's compositor, one part of a take per task",
+    "deliver": "Writes shot.blend and summary.json of the bake",
 }
 
 
@@ -68,21 +68,25 @@ def job_template(name: str, steps: Sequence[Step], needs: dict[str, Needs], bake
     """
     paths = paths_of([step.shot for step in steps])
     parameters: list[dict[str, Any]] = [
-        _parameter("Splannequin", "Folder of Splannequin on the hosts: it holds splannequin.py", "IN"),
-        _parameter("HostPython", "Any Python from 3.8 on the hosts, to begin with"),
-        _parameter("BackendPython", "Python with Splannequin's packages on the hosts; empty: it is set up"),
-        _parameter("Home", "Folder of the hosts where it is set up once; empty: Splannequin's own folder"),
+        _parameter("Splannequin", "Folder of Splannequin on the hosts, with splannequin.py in it", "IN"),
+        _parameter("HostPython", "Any Python from 3.8 on the hosts, used to start"),
+        _parameter(
+            "BackendPython", "Python with Splannequin's packages on the hosts; empty: it is set up automatically"
+        ),
+        _parameter("Home", "Folder on the hosts for this set-up, made once; empty: Splannequin's folder"),
     ]
     if bake:
         parameters += [
-            _parameter("Blender", "Blender's program on the hosts; empty: a bpy wheel is set up, or it is on the PATH"),
-            _parameter("OutputFolder", "Folder for what is baked: SHOT/TAKE/composited", "OUT"),
+            _parameter(
+                "Blender", "Path of Blender on the hosts; empty: a bpy wheel is set up, or Blender is on the PATH"
+            ),
+            _parameter("OutputFolder", "Output folder of the bake: SHOT/TAKE/composited", "OUT"),
         ]
     parameters += [_parameter(option, f"Path of the option {option}", "IN", "FILE") for option in sorted(paths)]
     return {
         "specificationVersion": VERSION,
         "name": _refused(name),
-        "description": "Frozen frames by Splannequin. Every task may run twice, also at once, and after a kill.",
+        "description": "Frozen frames by Splannequin. Every task can run twice, even at once, or after a kill.",
         "parameterDefinitions": parameters,
         "jobEnvironments": [_environment(bake)],
         "steps": [_step(step, before, needs[step.kind], paths, bake) for step, before in _chained(steps)],
@@ -237,7 +241,7 @@ def _refused(text: str) -> str:
     printable = "".join(c if c.isprintable() else "?" for c in text)
     if "{{" in text or "}}" in text:
         raise JobError(
-            f"{printable} cannot stand in a job template: two braces mean a reference there.",
+            f"{printable} cannot be used in a job template, where two braces mark a reference.",
             "Rename it without {{ and }}.",
             ExitCode.USAGE,
         )
@@ -249,13 +253,13 @@ def _refused_value(text: str) -> str:
     printable = "".join(c if c.isprintable() else "?" for c in text)
     if len(text) > MOST_LETTERS:
         raise JobError(
-            f"{printable[:100]}... has {len(text)} letters: a render farm's job takes {MOST_LETTERS}.",
+            f"{printable[:100]}... has {len(text)} characters, but a render farm's job allows {MOST_LETTERS}.",
             "Move it to a folder with a shorter path.",
             ExitCode.USAGE,
         )
     if re.search(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]", text):
         raise JobError(
-            f"{printable} cannot stand in a job template: its name holds control characters, or is not UTF-8.",
+            f"{printable} cannot be used in a job template: its name contains control characters or is not UTF-8.",
             "Rename it.",
             ExitCode.USAGE,
         )

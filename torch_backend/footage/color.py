@@ -107,7 +107,7 @@ def rgb_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
     """Matrix [3, 3] from linear RGB of these primaries to CIE XYZ, white at Y = 1. ValueError if they span no gamut."""
     x, y = np.array(chromaticities, np.float64).reshape(4, 2).T
     if not np.isfinite([*x, *y]).all() or abs(y[3]) < 1e-6:
-        raise ValueError(f"these are no chromaticities: {chromaticities}")
+        raise ValueError(f"these are not valid chromaticities: {chromaticities}")
     columns = np.stack([x[:3], y[:3], 1.0 - x[:3] - y[:3]])
     if abs(np.linalg.det(columns)) < 1e-6:
         raise ValueError(f"these primaries lie on one line: {chromaticities}")
@@ -134,7 +134,7 @@ def light_matrix(light: str) -> NDArray[np.float32] | None:
     Raises ValueError for other primaries.
     """
     if light not in LIGHTS:
-        raise ValueError(f"frames leave in the light of {', '.join(LIGHTS)}, not {light!r}")
+        raise ValueError(f"the output light should be one of {', '.join(LIGHTS)}, not {light!r}")
     if light == LIGHTS[0]:
         return None
     return np.linalg.inv(to_rec709(PRIMARIES[light][1])).T.astype(np.float32)
@@ -228,7 +228,7 @@ class InputSpace:
     @property
     def name(self) -> str:
         """Name for messages."""
-        gamut = PRIMARIES[self.primaries][0] if self.primaries else "primaries of its own"
+        gamut = PRIMARIES[self.primaries][0] if self.primaries else "custom primaries"
         return f"{TRANSFERS[self.transfer]}, {gamut}"
 
     @property
@@ -272,7 +272,7 @@ class InputSpace:
         Raises ValueError if the space holds light, which needs `to_linear` and a `display.Display`.
         """
         if self.is_light:
-            raise ValueError(f"{self.name} holds light: sRGB would cut it")
+            raise ValueError(f"{self.name} is scene-linear light, which sRGB would clip")
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=65504.0, neginf=0.0)
         if self.is_passthrough:
             return np.clip(pixels, 0.0, 1.0)

@@ -94,7 +94,7 @@ def find_depth(shot: Shot, source: str, report: Reporter) -> DepthSequence:
         raise footage_error(
             f"None of the depth maps {sequence.pattern} ({numbers[0]} to {numbers[-1]}) belongs to a frame "
             f"({counted.frames[0]} to {counted.frames[-1]}).",
-            "Number them as the clip's frames.",
+            "Number them like the clip's frames.",
         )
     words = pairing_words(f"The depth sequence {sequence.pattern}", numbers, paired)
     if words is not None:
@@ -129,11 +129,11 @@ def read_map(file: Path) -> NDArray[np.float32]:
     finally:
         image.close()
     if values.shape[2] > 1 and float(np.ptp(np.nan_to_num(values), axis=2).max()) > _GREY:
-        raise UnusableMap("is a coloured picture, not a map of depth")
+        raise UnusableMap("is a colour picture, not a depth map")
     one = values[..., 0].copy()
     one[~(np.isfinite(one) & (one != 0.0) & (np.abs(one) < _FARTHEST))] = np.nan
     if not np.isfinite(one).any():
-        raise UnusableMap("holds no depth")
+        raise UnusableMap("contains no depth")
     return one
 
 
@@ -149,7 +149,7 @@ def _depth_channels(file: Path, image: oiio.ImageInput) -> tuple[int, range]:
         except JobError as error:
             raise UnusableMap("is too large") from error
         if spec.deep:
-            raise UnusableMap("holds deep data")
+            raise UnusableMap("contains deep data")
         names = list(channel_names(spec))
         seen += names
         for rank, channels in _candidates(names, spec.alpha_channel, is_exr):

@@ -82,7 +82,7 @@ class Display:
         Raises ValueError if this display has no shoulder, because sRGB would clip the light.
         """
         if not self.bends:
-            raise ValueError("a display without a shoulder does not hold light")
+            raise ValueError("a display without a shoulder cannot show scene-linear light")
         small = plate_encoding.resize_plate(plate, width, height)
         out = np.empty(small.shape, np.uint16)
         for top in range(0, height, plate_encoding.ROWS):
@@ -127,6 +127,6 @@ def display_of(record: dict[str, Any]) -> Display:
     if name == ROLLED.name:
         return Display(bends=True, most=float(record.get("brightest", 1.0)))
     raise footage_error(
-        f"The working frames are in a display that this version does not know: {name!r}.",
+        f"The working frames use a display encoding that this version does not know: {name!r}.",
         "Update Splannequin, or import the clip again.",
     )

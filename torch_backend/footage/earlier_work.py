@@ -99,9 +99,9 @@ class EarlierWork:
         rows, name = self.record.get("frames"), self.shot.root.name
         clip, span = self.shot.info().source, f", frames {rows[0]['frame']} to {rows[-1]['frame']}" if rows else ""
         return JobError(
-            f"{name} holds {', '.join(self.words)} of {clip}{span}: this import would replace its frames.",
-            "Import into another shot folder, or consent with --replace (in Blender: confirm the question of Import "
-            f"Clip): all of that then moves to {self.shot.replaced}, and nothing is deleted.",
+            f"{name} contains {', '.join(self.words)} of {clip}{span}. This import would replace its frames.",
+            "Import into another shot folder, or agree with --replace (in Blender: confirm the question of Import "
+            f"Clip). All of that then moves to {self.shot.replaced}, and nothing is deleted.",
             ExitCode.USAGE,
         )
 
@@ -109,8 +109,8 @@ class EarlierWork:
         """The warning (message, hint) after an import that replaced earlier work."""
         place = self.shot.replaced / str(order["replaced"])
         return (
-            f"What was in the shot ({', '.join(self.words)}) is kept in {place}.",
-            "It opens as a shot of its own; delete it once you do not need it.",
+            f"The shot's earlier work ({', '.join(self.words)}) is kept in {place}.",
+            "It opens as a separate shot; delete it when it is no longer needed.",
         )
 
 

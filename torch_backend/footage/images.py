@@ -73,7 +73,8 @@ def check_size(name: str, spec: oiio.ImageSpec) -> None:
 def too_large(name: str, width: int, height: int) -> JobError:
     """The error for a picture with more than `MOST_PIXELS`."""
     return JobError(
-        f"{name} is {width} x {height} pixels, or says so: at most {MOST_PIXELS >> 20} megapixels are read.",
+        f"{name} is {width} x {height} pixels according to its header, but at most {MOST_PIXELS >> 20} megapixels "
+        "are supported.",
         "Make it smaller.",
         ExitCode.FOOTAGE,
     )

@@ -89,7 +89,7 @@ def _cut_error(numbers: list[int], found: list[Transition]) -> Exception:
         f"The clip has {', '.join(where)}: a freeze needs one continuous take.",
         f"Pass the range of one take: {', '.join(takes[:6])} (for example --first {longest[0]} --last {longest[1]})."
         if takes
-        else f"No take of it has {LEAST_FRAMES} frames: choose another clip.",
+        else f"None of its takes has {LEAST_FRAMES} frames: choose another clip.",
     )
 
 
@@ -116,15 +116,19 @@ def remarks(extracted: Extracted) -> list[tuple[str, str]]:
     if extracted.clipped > CLIPPED_SHARE:
         remarks.append(
             (
-                f"Up to {100 * extracted.clipped:.0f} % of a frame is brighter than {MOST_LIGHT:.0f} times white: what "
-                "splats show of it is cut there.",
+                f"Up to {100 * extracted.clipped:.0f} % of a frame is brighter than {MOST_LIGHT:.0f} times white: "
+                "splats clip these areas.",
                 "Lower the exposure.",
             )
         )
     if len(measures) > MANY_FRAMES:
-        remarks.append((f"The clip has {len(measures)} frames, which will take long.", "Take a shorter range."))
+        remarks.append(
+            (f"The clip has {len(measures)} frames, which will take a long time.", "Choose a shorter range.")
+        )
     for flag, words in (("duplicate", "repeats"), ("blank", "blank"), ("corrupt", "damaged")):
         numbers = [m.frame for m in measures if flag in m.flags]
         if numbers:
-            remarks.append((f"Neither solved nor trained on, for being {words}: {frame_words(numbers)}.", ""))
+            remarks.append(
+                (f"Not used for the solve and the training because they are {words}: {frame_words(numbers)}.", "")
+            )
     return remarks

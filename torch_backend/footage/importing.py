@@ -250,7 +250,7 @@ def _check_range(opened: Source, config: FootageConfig, shift: int) -> None:
     first = info.first if config.first is None else config.first
     last = info.last if config.last is None else config.last
     if first > info.last or last < info.first:
-        raise footage_error(f"Frames {first} to {last} lie outside of the clip, which has {info.first} to {info.last}.")
+        raise footage_error(f"Frames {first} to {last} lie outside the clip, which has {info.first} to {info.last}.")
     first, last = max(first, info.first) + shift, min(last, info.last) + shift
     if last > LAST_FRAME or first < 0:
         raise footage_error(
@@ -339,9 +339,9 @@ def _log_remark(info: SourceInfo, config: FootageConfig, extracted: Extracted) -
     colour = info.reading.get("colour", "video")
     return [
         (
-            f"The picture is as flat as log: its darkest tones are at {100 * tones[0]:.0f} %, its brightest at "
-            f"{100 * tones[1]:.0f} %. It was taken as {colour}.",
-            "If it is log, name its colour space (--colour-space, such as 'ARRI LogC3 (EI800)'), or a look (--lut).",
+            f"The picture looks as flat as log footage: its darkest tones are at {100 * tones[0]:.0f} %, its "
+            f"brightest at {100 * tones[1]:.0f} %. It was read as {colour}.",
+            "If it is log, set its colour space (--colour-space, such as 'ARRI LogC3 (EI800)'), or a look (--lut).",
         )
     ]
 
@@ -423,8 +423,8 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
     if mark is not None:
         ignored[inner] |= mark
         report.warning(
-            f"{100 * float(mark.mean()):.1f} % of the picture stands still while the world goes by: a logo, a caption? "
-            "It is ignored, and frozen frames show what is behind it.",
+            f"{100 * float(mark.mean()):.1f} % of the picture stands still while the camera moves, for example a "
+            "logo or a caption. It is ignored, and frozen frames show what is behind it.",
             "If it is part of the scene, set Ignore to None before the solve (Masks, or --ignore-mask none).",
         )
     write_png(fresh / BURNT_IN_FILE, np.repeat(np.where(ignored, np.uint8(255), np.uint8(0))[..., None], 3, axis=2))

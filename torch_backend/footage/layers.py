@@ -57,8 +57,8 @@ def find_layer(file: Path, layer_name: str = "") -> tuple[Layer, list[str]]:
         )
     if len(ranked) > 1 and (_rank(ranked[0]) == _rank(ranked[1]) or _rank(ranked[0])[0] == len(BEAUTY)):
         raise footage_error(
-            f"{file.name} has several layers and none is named as the picture itself: {_listed(names)}.",
-            "Choose one by its name (--layer), or write the picture to a file of its own.",
+            f"{file.name} has several layers, and none is recognised as the picture itself: {_listed(names)}.",
+            "Choose one by its name (--layer), or write the picture to a separate file.",
         )
     return ranked[0], names
 
@@ -92,7 +92,7 @@ def _layers(file: Path) -> tuple[list[Layer], list[str]]:
             spec = image.spec()
             check_size(file.name, spec)
             if spec.deep:
-                raise footage_error(f"{file.name} holds deep data.", "Flatten it before import.")
+                raise footage_error(f"{file.name} contains deep data.", "Flatten it before import.")
             several = spec.get_int_attribute("oiio:subimages") > 1
             title = str(spec.getattribute("oiio:subimagename") or "") if several else ""
             for prefix in dict.fromkeys(name.rpartition(".")[0] for name in channel_names(spec)):

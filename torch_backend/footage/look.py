@@ -64,18 +64,20 @@ def look_space(file: str) -> LookSpace:
     path = Path(file)
     hint = "Choose a 1D or 3D look as .cube."
     if path.suffix.lower() != ".cube":
-        raise footage_error(f"{path.name} is no .cube file.", hint)
+        raise footage_error(f"{path.name} is not a .cube file.", hint)
     try:
         with open_regular(path) as handle:
             content = handle.read(_MOST_BYTES + 1)
     except OSError as error:
         raise footage_error(f"The look {file} cannot be read: {error.strerror or error}.", hint) from error
     if len(content) > _MOST_BYTES:
-        raise footage_error(f"The look {path.name} is larger than {_MOST_BYTES >> 20} MB.", "Export it smaller: 65.")
+        raise footage_error(
+            f"The look {path.name} is larger than {_MOST_BYTES >> 20} MB.", "Export it with a smaller size, such as 65."
+        )
     space = LookSpace("srgb", file=str(path.absolute()), digest=hashlib.sha256(content).hexdigest()[:16])
     shown = _through(np.linspace(0.0, 1.0, 12, dtype=np.float32).reshape(1, 4, 3), space.file)
     if not np.isfinite(shown).all():
-        raise footage_error(f"The look {path.name} holds values that are no numbers.", "Export it again.")
+        raise footage_error(f"The look {path.name} contains values that are not numbers.", "Export it again.")
     return space
 
 
@@ -87,7 +89,7 @@ def _through(pixels: NDArray[np.float32], file: str) -> NDArray[np.float32]:
     if values is None:
         error_of(shown)  # clears the error; OpenColorIO's message is about file formats
         raise footage_error(
-            f"The look {Path(file).name} is damaged, or no .cube table: it cannot be read.",
+            f"The look {Path(file).name} cannot be read: it is damaged, or not a .cube table.",
             "Export it again as a 1D or 3D .cube.",
         )
     return np.asarray(values, np.float32)

@@ -98,8 +98,8 @@ def read_masks(shot: Shot, sources: dict[str, str], report: Reporter) -> dict[st
     if covered > _ALL:
         words = " and ".join(WORDS[kind] for kind in masks)
         raise footage_error(
-            f"The mask of {words} covers {100 * covered:.0f} % of the picture: nothing is left to solve the camera by.",
-            "White is what is masked: invert it if it was made the other way round.",
+            f"The mask of {words} covers {100 * covered:.0f} % of the picture: too little is left to solve the camera.",
+            "White is masked: invert the mask if it was made the other way round.",
         )
     return masks
 
@@ -128,9 +128,9 @@ class _Reading:
             self.report.progress("solve: masks", done, len(self.numbers), WORDS[self.kind])
         result.share = total / max(1, len(self.numbers))
         if total == 0.0:
-            hint = "White is what is masked, from half of it on."
+            hint = "White is masked, from 50 % grey upwards."
             if self.source == MASK_ALPHA:
-                hint = "Ignored is what is transparent; what is opaque may move."
+                hint = "Transparent areas are ignored; opaque areas may move."
             raise footage_error(f"{self.name} covers nothing in any frame.", hint)
         return result
 
@@ -146,7 +146,7 @@ class _Reading:
         full = self.frames.get("source_size") or self.size
         if w * h > max(full[0] * full[1], _MOST_PIXELS):
             raise footage_error(
-                f"{self.name} is {w}x{h}, the footage {full[0]}x{full[1]}: it has far more pixels than are of use.",
+                f"{self.name} is {w}x{h}, the footage {full[0]}x{full[1]}: it has far more pixels than needed.",
                 "Render the mask at the footage's size, or a fraction of it.",
             )
         aspect = float(self.frames.get("reading", {}).get("pixel_aspect", 1.0))
@@ -154,7 +154,7 @@ class _Reading:
         # A mask of anamorphic footage has square pixels, or the pixels of the footage.
         if all(abs(shape / (full[0] / full[1] / stretch) - 1.0) > _SHAPE for stretch in (1.0, aspect)):
             raise footage_error(
-                f"{self.name} is {w}x{h}, the footage {full[0]}x{full[1]}: they have not the same shape.",
+                f"{self.name} is {w}x{h}, the footage {full[0]}x{full[1]}: their aspect ratios differ.",
                 "Render the mask at the footage's size, or a fraction of it.",
             )
 
@@ -197,7 +197,7 @@ class _Reading:
         if black + white >= _MATTE and min(black, white) >= 1.0 - _MATTE:
             self.report.warning(f"{self.name} is black and white with an alpha: white is masked where it is opaque.")
             return _BOTH
-        self.report.warning(f"{self.name} has an alpha: what is opaque is masked, its colour is passed over.")
+        self.report.warning(f"{self.name} has an alpha channel: opaque areas are masked, and its colour is ignored.")
         return _ALPHA
 
     def _files(self, path: Path) -> dict[int | None, Path]:
@@ -214,7 +214,7 @@ class _Reading:
         if missing:
             raise footage_error(
                 f"{self.name} has no picture for {frame_words(missing)}, of {len(self.numbers)} frames.",
-                "Number it as the clip's frames, or give one picture, without a number in its name, for all of them.",
+                "Number it like the clip's frames, or use one picture without a number in its name for all of them.",
             )
         words = pairing_words(self.name, pictures, paired)
         if words is not None:
@@ -270,13 +270,16 @@ class _Reading:
             file = files[number]
             found = find_layer(file, layer)[0]
             if found.alpha is None:
-                raise footage_error(f"{file.name} has no alpha to mask by.", "Give the mask as pictures of their own.")
+                raise footage_error(
+                    f"{file.name} has no alpha channel to use as a mask.", "Provide the mask as separate pictures."
+                )
             yield number, _read(file, found.part)[0][..., found.alpha]
 
     def _of_video(self, video: VideoSource) -> Iterator[tuple[int, NDArray[np.float32]]]:
         if not video.has_alpha:
             raise footage_error(
-                f"{video.path.name} has no alpha to mask by.", "Give the mask as pictures of their own, or a video."
+                f"{video.path.name} has no alpha channel to use as a mask.",
+                "Provide the mask as separate pictures, or as a video.",
             )
         missing = set(self.numbers)
         for footage_number, alpha in video.alphas(self.numbers[-1] - self.counted.shift):
@@ -286,7 +289,7 @@ class _Reading:
                 yield number, alpha
         if missing:
             raise footage_error(
-                f"The alpha of {frame_words(sorted(missing))} of {video.path.name} cannot be read any more.",
+                f"The alpha of {frame_words(sorted(missing))} of {video.path.name} can no longer be read.",
                 "The file has changed or is damaged: import the clip again.",
             )
 
@@ -308,8 +311,8 @@ class _Reading:
                 files = {number: available[number - self.counted.shift] for number in self.numbers}
                 return files, settings.layer
         raise footage_error(
-            f"The footage {self.shot.info().source} cannot be read any more: its alpha is not known.",
-            "Put it back where it was, or give the mask as pictures of their own.",
+            f"The footage {self.shot.info().source} can no longer be read, so its alpha is unknown.",
+            "Move it back to this path, or provide the mask as separate pictures.",
         )
 
 
@@ -323,7 +326,7 @@ def _opened(file: Path, part: int = 0) -> tuple[oiio.ImageBuf, Orientation]:
     buffer = oiio.ImageBuf(regular_file(file), part, 0, AS_STORED)
     spec = buffer.spec()
     if buffer.has_error:
-        raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Write it again.")
+        raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Export it again.")
     check_size(file.name, spec)
     return buffer, orientation_of_picture(spec) or UPRIGHT
 
@@ -335,7 +338,7 @@ def _pixels(file: Path, buffer: oiio.ImageBuf, orientation: Orientation) -> tupl
     roi = oiio.ROI(x, x + spec.full_width, y, y + spec.full_height, 0, 1, 0, spec.nchannels)
     pixels = buffer.get_pixels(oiio.FLOAT, roi)
     if pixels is None or buffer.has_error:
-        raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Write it again.")
+        raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Export it again.")
     upright = orientation.upright(np.asarray(pixels, np.float32))
     alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
     if alpha is not None and not spec.get_int_attribute("oiio:UnassociatedAlpha"):

@@ -91,7 +91,10 @@ class Colours:
             return found
         names = space_names(config)
         if any(name.lower() == self.chosen.lower() for name in names):
-            raise footage_error(f"{self.chosen!r} is no colour but data.", "Name the colour space of the footage.")
+            raise footage_error(
+                f"{self.chosen!r} is a colour space for data, not for colour.",
+                "Choose the colour space of the footage.",
+            )
         near = get_close_matches(self.chosen, names, 4, 0.3) or names[:4]
         raise footage_error(
             f"The OCIO configuration {config} has no colour space {self.chosen!r}.",
@@ -183,7 +186,7 @@ def _way_out(config: str) -> tuple[str, Callable[[ArrayLike], NDArray[np.float32
             return names[resolved], None
     raise footage_error(
         f"The OCIO configuration {config} names neither ACES2065-1 (role {INTERCHANGE}) nor linear Rec.709.",
-        f"Give it the role {INTERCHANGE}, as configurations of OCIO 2 have it.",
+        f"Add the role {INTERCHANGE}, as OCIO 2 configurations have it.",
     )
 
 
@@ -197,7 +200,9 @@ def light_of(pixels: NDArray[np.float32], space: str, config: str) -> NDArray[np
     light = oiio.ImageBufAlgo.colorconvert(source, space, target, False, "", "", config)
     values = None if light.has_error else light.get_pixels(oiio.FLOAT)
     if values is None:
-        raise footage_error(f"{space!r} cannot be converted to light: {error_of(light)}.", "Name another colour space.")
+        raise footage_error(
+            f"{space!r} cannot be converted to scene-linear light: {error_of(light)}.", "Choose another colour space."
+        )
     values = np.asarray(values, np.float32)
     with np.errstate(all="ignore"):  # codes outside of a camera's range may become infinite light
         return values if finish is None else finish(values)

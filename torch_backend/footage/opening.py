@@ -53,7 +53,7 @@ def open_source(
     layer = "" if video.has_streams else layer
     for value, what, kept in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
         if value:
-            video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {kept}.", ""))
+            video.warnings.append((f"The {what} {value!r} is ignored: a video has its own, {kept}.", ""))
     return video
 
 
@@ -119,5 +119,5 @@ def _pictures(path: Path, fps: float, layer: str, colours: Colours, overrides: O
     pictures = SequenceSource(find_sequence(path), fps, layer, colours, overrides.pixel_aspect, overrides.look)
     for value, what in ((overrides.matrix, "matrix"), (overrides.levels, "levels")):
         if value:
-            pictures.warnings.append((f"The {what} {value!r} is passed over: pictures hold RGB as it is.", ""))
+            pictures.warnings.append((f"The {what} {value!r} is ignored: pictures already store RGB.", ""))
     return pictures

@@ -123,9 +123,9 @@ def pairing_words(name: str, pictures: Sequence[int], paired: Pairing) -> tuple[
         return None
     frame, picture = next(iter(paired.numbers.items()))
     last = list(paired.numbers)[-1]
-    how = "each is taken for the frame of its number" if paired.by_frame_number else "they are taken in order"
+    how = "matched by number" if paired.by_frame_number else "matched in order"
     return (
-        f"{name} is numbered {pictures[0]} to {pictures[-1]}, the frames {frame} to {last}: picture {picture} is taken "
-        f"for frame {frame}, {how}.",
-        "If that is not the right frame, number the pictures as the shot's frames.",
+        f"{name} is numbered {pictures[0]} to {pictures[-1]}, the frames {frame} to {last}: picture {picture} is "
+        f"used for frame {frame}, {how}.",
+        "If that is not the right frame, number the pictures like the shot's frames.",
     )

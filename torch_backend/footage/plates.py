@@ -156,8 +156,8 @@ class Plates:
             picture = self._reader.plate(frame)
         except OSError as error:
             raise JobError(
-                f"Frame {frame} of the footage cannot be read any more: {error}.",
-                "Check that the disk it lies on is there, and that the file is whole.",
+                f"Frame {frame} of the footage can no longer be read: {error}.",
+                "Check that its disk is connected and that the file is complete.",
                 ExitCode.FOOTAGE,
             ) from error
         return self._undistorted(plate_encoding.resize_plate(picture, self.width, self.height), frame)
@@ -188,7 +188,7 @@ class Plates:
                 return None, ""
             if self._is_imported(source, record, config):
                 return source, ""
-            return None, f"The footage {place} is not what was imported any more. {STAYS}"
+            return None, f"The footage {place} has changed since the import. {STAYS}"
         return None, f"The footage {self._shot.info().source or 'of this shot'} cannot be read. {STAYS}"
 
     def _opened(self, record: dict[str, Any], config: FootageConfig) -> Iterator[tuple[str, Source]]:

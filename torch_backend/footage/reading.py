@@ -44,4 +44,4 @@ def read_as(info: SourceInfo, timecode: str = "") -> list[str]:
     if reading.get("files"):
         first, last = reading["numbers"]
         sentences.append(f"Frames {first} to {last} are read from {reading['files']}.")
-    return sentences + [f"Assumed, for the footage does not say: {', '.join(assumed)}."] * bool(assumed)
+    return sentences + [f"Assumed, because the footage does not state it: {', '.join(assumed)}."] * bool(assumed)

@@ -95,7 +95,7 @@ class VideoReader:
             frame = self._forward(number)
         if frame is None:
             raise footage_error(
-                f"Frame {number} of {self._source.path.name} cannot be decoded any more.",
+                f"Frame {number} of {self._source.path.name} can no longer be decoded.",
                 "The file has changed or is damaged: import the clip again.",
             )
         return self._source.plate_of(frame)

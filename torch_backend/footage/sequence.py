@@ -55,8 +55,8 @@ _IN_BLENDER = {
 
 
 _NO_ORIENTATION = (
-    "The pictures' header has an orientation that EXIF does not know: they are read as they are stored.",
-    "Write them upright if they look turned.",
+    "The pictures' header has an orientation that EXIF does not define: they are read as stored.",
+    "Export them upright if they look rotated.",
 )
 
 
@@ -64,7 +64,7 @@ def _several_numbers(pattern: str) -> tuple[str, str]:
     """The warning about file names in which more than one number varies."""
     return (
         f"Several numbers vary in the names: the frame number was read where # stands in {pattern}.",
-        "If another one counts the frames, name the clip by a pattern with # in its place.",
+        "If another number counts the frames, choose the clip by a pattern with # in its place.",
     )
 
 
@@ -170,7 +170,7 @@ class SequenceSource:
             self.warnings.append(
                 (
                     f"The sequence lacks {frame_words(missing)}.",
-                    "They are frozen through cameras between those of their neighbours, over two seconds at most.",
+                    "They are frozen with cameras interpolated from their neighbours, in gaps of two seconds at most.",
                 )
             )
         unreadable: list[int] = []
@@ -187,7 +187,7 @@ class SequenceSource:
             self.warnings.append((f"{words} cannot be read: left out of the shot.", "Render or copy it again."))
         if findings.transparent:
             self.warnings.append(
-                ("The pictures are transparent in places: their colour is taken, their alpha is not.", "")
+                ("The pictures are transparent in places: their colour is used, their alpha is ignored.", "")
             )
         if findings.cropped:
             self.warnings.append(("Pictures fill only a part of their frame: the rest of it is black.", ""))
@@ -196,7 +196,7 @@ class SequenceSource:
         """Warns about a chosen layer, pixels that are not square, and a conversion of primaries."""
         if len(names) > 1 and not requested_layer:
             unused = ", ".join(shown(n) for n in names if n != self._layer.name)
-            message = f"The pictures have {len(names)} layers: {shown(self._layer.name)} is taken."
+            message = f"The pictures have {len(names)} layers: {shown(self._layer.name)} is used."
             self.warnings.append((message, f"The others: {unused}."))
         if self._aspect != 1:
             self.warnings.append(
@@ -223,7 +223,7 @@ class SequenceSource:
             why = why or f"{file.name}: {failed}"
         raise footage_error(
             f"No picture of the sequence in {next(iter(self._files.values())).parent} can be read: {why}.",
-            "Open one in Blender to see whether it is whole.",
+            "Open one in Blender to check whether it is damaged.",
         )
 
     def plates(self, known: Known) -> PlateReader:
@@ -233,7 +233,7 @@ class SequenceSource:
     def plate(self, number: int) -> NDArray[Any]:
         """See `PlateReader.plate`."""
         if number not in self._files:
-            raise footage_error(f"Frame {number} of the sequence is not there any more.", "Put it back.")
+            raise footage_error(f"Frame {number} of the sequence is missing.", "Put it back.")
         rgb = self._stored_pixels(self._files[number], _Findings())
         if self.info.extended:
             return self._light(rgb)
@@ -273,13 +273,16 @@ class SequenceSource:
             # programs turn the pixels of a few files. So neither each file's tag nor the first tag is reliable.
             words = [one.words or "stored upright" for one in (orientation, self._orientation)]
             raise footage_error(
-                f"{file.name} is {words[0]} by its header, the sequence began with pictures that are {words[1]}.",
-                "All pictures of a sequence need one orientation: write them upright, or take a range that has one.",
+                f"{file.name} is {words[0]} according to its header, but the sequence starts with pictures that are "
+                f"{words[1]}.",
+                "All pictures of a sequence need the same orientation: export them upright, or choose a range with "
+                "one orientation.",
             )
         if size != self._stored:
             raise footage_error(
-                f"{file.name} is {size[0]}x{size[1]}, the sequence began with {self._stored[0]}x{self._stored[1]}.",
-                "All pictures of a sequence need one size.",
+                f"{file.name} is {size[0]}x{size[1]}, but the sequence starts with "
+                f"{self._stored[0]}x{self._stored[1]}.",
+                "All pictures of a sequence need the same size.",
             )
         channels = [*layer.channels] if layer.alpha is None else [*layer.channels, layer.alpha]
         first, beyond = min(channels), max(channels) + 1
@@ -306,7 +309,7 @@ class SequenceSource:
         layer = find_layer(file, self._layer.name)[0]
         if layer.name != self._layer.name:
             raise footage_error(
-                f"{file.name} has no layer {shown(self._layer.name)}, with which the sequence began.",
+                f"{file.name} has no layer {shown(self._layer.name)}, which the first picture of the sequence has.",
                 "All pictures of a sequence need the same layers.",
             )
         return layer
@@ -336,7 +339,7 @@ def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
 def _mismatch(spec: oiio.ImageSpec, layers: int, aspect: Fraction, orientation: Orientation) -> str:
     """Why other programs show such pictures differently, see `SourceInfo.mismatch`."""
     if orientation != UPRIGHT:  # Blender ignores the orientation tag, up to 5.2
-        return f"its pictures are {orientation.words} by their header"
+        return f"its pictures are {orientation.words} according to their header"
     if aspect != 1:
         return "its pixels are not square"
     if layers > 1:
@@ -431,8 +434,8 @@ def _input_space(file: Path, spec: oiio.ImageSpec, colours: Colours, warnings: l
     if name and name.lower() not in ("unknown", "data"):
         warnings.append(
             (
-                f"The pictures' colour space {name!r} is not known here: taken as {assumed.name}.",
-                "Name their colour space (--colour-space) if the picture looks wrong.",
+                f"The pictures' colour space {name!r} is unknown: read as {assumed.name}.",
+                "Set their colour space (--colour-space) if the picture looks wrong.",
             )
         )
     return assumed
@@ -450,7 +453,7 @@ def _film_space(suffix: str, transfer: str, warnings: list[tuple[str, str]]) -> 
         warnings.append(
             (
                 "The pictures are Cineon log: read with black at code 95, white at 685 and Rec.709 primaries.",
-                "Name their colour space (--colour-space), such as ADX10, if they are another log.",
+                "Set their colour space (--colour-space), such as ADX10, if they are another log.",
             )
         )
         return InputSpace("cineon")
@@ -460,8 +463,8 @@ def _film_space(suffix: str, transfer: str, warnings: list[tuple[str, str]]) -> 
         return InputSpace("g24")
     warnings.append(
         (
-            "The pictures do not say how their colour is encoded: taken as Rec.709 video, not as log.",
-            "Name their colour space (--colour-space) if they look flat.",
+            "The pictures do not say how their colour is encoded: read as Rec.709 video, not as log.",
+            "Set their colour space (--colour-space) if they look flat.",
         )
     )
     return InputSpace("g24", declared=False)

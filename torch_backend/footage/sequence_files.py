@@ -61,7 +61,7 @@ def find_sequence(path: Path) -> PictureSequence:
     Raises JobError if there is no sequence, if the file has no number, or if several sequences match.
     """
     if path.is_dir():
-        return _only(path, _sequences_in(path, _names_in(path)), f"The folder {path} holds", _no_sequence_in(path))
+        return _only(path, _sequences_in(path, _names_in(path)), f"The folder {path} contains", _no_sequence_in(path))
     if not path.exists():
         found = matching_files(_names_in(path.parent), path.name)
         missing = footage_error(
@@ -92,7 +92,8 @@ def numbered_neighbours(path: Path) -> NumberedFiles | None:
 def unreadable_pictures(pattern: str) -> JobError:
     """The error for numbered files that OpenImageIO cannot read."""
     return footage_error(
-        f"{pattern} cannot be read: OpenImageIO does not know the ending {ending(pattern) or 'of these pictures'}.",
+        f"{pattern} cannot be read: OpenImageIO does not know the file extension "
+        f"{ending(pattern) or 'of these pictures'}.",
         "Convert them to PNG, TIFF or EXR.",
     )
 
@@ -139,5 +140,5 @@ def _no_sequence_in(folder: Path) -> JobError:
     if candidates and len(candidates[0].files) >= LEAST_FRAMES and not _is_readable(candidates[0]):
         return unreadable_pictures(candidates[0].pattern)
     return footage_error(
-        f"The folder {folder} holds no numbered image sequence.", "Choose a folder with frames, or a video."
+        f"The folder {folder} contains no numbered image sequence.", "Choose a folder with frames, or a video."
     )

@@ -90,8 +90,8 @@ def overrides_of(config: ImportParams) -> Overrides:
     matrix, levels = ("" if value == "auto" else value for value in (config.matrix, config.levels))
     if config.lut and config.colour_space:
         raise footage_error(
-            f"A colour space ({config.colour_space}) and a look ({config.lut}) are both given.",
-            "Give one of them: a look already makes a picture for a display.",
+            f"Both a colour space ({config.colour_space}) and a look ({config.lut}) are set.",
+            "Use only one: a look already converts the picture for a display.",
         )
     look = mapped(config.lut) if config.lut else ""
     return Overrides(matrix, levels, Fraction(config.pixel_aspect).limit_denominator(10_000) or None, look)
@@ -166,7 +166,7 @@ def believable_aspect(aspect: Fraction, warnings: list[tuple[str, str]]) -> Frac
     """The pixel aspect if plausible; otherwise 1, with a warning."""
     if 1 / LONGEST_PIXEL <= aspect <= LONGEST_PIXEL:
         return aspect
-    warnings.append((f"The footage claims pixels {float(aspect):g} times as wide as high: taken as square.", ""))
+    warnings.append((f"The footage claims pixels {float(aspect):g} times as wide as high: read as square.", ""))
     return Fraction(1)
 
 

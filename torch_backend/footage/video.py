@@ -73,8 +73,8 @@ _MOST_INTERLACED = 1088
 _fields_of: dict[tuple[str, int, int], str] = {}
 """(path, size, modification time) of a file -> its `decoding.unmarked_fields`."""
 _NO_ORIENTATION = (
-    "The clip's header asks to show the picture at an angle or stretched, which is neither a quarter turn nor a "
-    "mirroring: frames are read as they are stored.",
+    "The clip's header asks to show the picture at an angle or stretched, but only quarter turns and mirroring are "
+    "supported: frames are read as stored.",
     "Export the clip upright if its frames should look otherwise.",
 )
 
@@ -169,19 +169,19 @@ class VideoSource:
         """Why other programs show the clip differently, see `SourceInfo.mismatch`."""
         tagged = coding_of(frame)
         if self._is_picture:
-            return "Blender shows an animated picture as a still one"
+            return "Blender shows an animated picture as a still"
         if self._aspect != 1:
             return "its pixels are not square"
         if orientation is None or orientation.is_mirrored:  # Blender 5 rotates instead of mirroring
             return f"its header says that it is {orientation.words if orientation else 'turned or stretched'}"
         if not self._is_first_stream:
-            return "it has several video streams, of which other programs show another"
+            return "it has several video streams, and other programs show another one"
         if self._interlaced:
-            return "it is interlaced, and frames are made of its fields here"
+            return "it is interlaced, and frames are built from its fields"
         if (tagged.matrix, tagged.is_full) != (self._coding.matrix, self._coding.is_full):
-            return "its matrix or range was set by hand"
+            return "its matrix or levels were set by hand"
         if not tagged.is_matrix_declared and tagged.matrix != BT601:  # FFmpeg, and therefore Blender, assume BT.601
-            return "it does not say by which matrix its colours are stored"
+            return "it does not state its colour matrix"
         return ""
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
@@ -229,7 +229,7 @@ class VideoSource:
         Omits undecodable frames. Raises JobError if the clip has no alpha, or changes its size.
         """
         if not self.has_alpha:
-            raise footage_error(f"{self.path.name} has no alpha.", "Give the mask as pictures of their own.")
+            raise footage_error(f"{self.path.name} has no alpha.", "Provide the mask as separate pictures.")
         with self._open() as container:
             stream = stream_of(container, self.path, self.layer)
             stream.thread_type = "AUTO"
@@ -243,7 +243,9 @@ class VideoSource:
                 if isinstance(frame, FFmpegError):
                     continue
                 if self._shown_size(frame) != self._size:
-                    raise footage_error(f"{self.path.name} changes its size at frame {number}.", "Export it in one.")
+                    raise footage_error(
+                        f"{self.path.name} changes its size at frame {number}.", "Export it in one size."
+                    )
                 alpha = frame.reformat(format="rgba").to_ndarray()[..., 3].astype(np.float32) * np.float32(1 / 255)
                 orientation = self._orientation_of(frame)
                 if orientation.swaps_sides:  # a quarter turn would invert the pixel aspect: resample to square pixels
@@ -307,10 +309,10 @@ class VideoSource:
         promised = count if last is None else min(last, count)
         if not short or seen.number >= promised:
             return
-        message = f"{self.path.name} breaks off after frame {seen.number}: it announces {count}."
-        hint = "It is damaged or was not copied whole: copy or export it again."
+        message = f"{self.path.name} ends after frame {seen.number}, but its header announces {count}."
+        hint = "It is damaged or was not copied completely: copy or export it again."
         if 2 * (seen.number - begin + 1) < promised - begin + 1:
-            remedy = f" To use what is there, set the last frame to {seen.number}." if seen.number > 7 else ""
+            remedy = f" To use the frames before that, set the last frame to {seen.number}." if seen.number > 7 else ""
             raise footage_error(message, hint + remedy)
         self.warnings.append((message, hint))
 
@@ -325,8 +327,8 @@ class VideoSource:
             number = 1 + [one.index for one in streams].index(stream.index)
             self.warnings.append(
                 (
-                    f"The clip has {len(streams)} video streams: number {number} is taken, {size_words(stream)}.",
-                    f"Name another by its number (--layer): {listed(streams)}.",
+                    f"The clip has {len(streams)} video streams: number {number} is used, {size_words(stream)}.",
+                    f"Choose another by its number (--layer): {listed(streams)}.",
                 )
             )
 
@@ -383,7 +385,8 @@ class VideoSource:
         if space.transfer in ("pq", "hlg"):
             self.warnings.append(
                 (
-                    f"The clip is HDR ({space.name}): converted to light, white at {DIFFUSE_WHITE_NITS:.0f} cd/m2.",
+                    f"The clip is HDR ({space.name}): converted to scene-linear light, white at "
+                    f"{DIFFUSE_WHITE_NITS:.0f} cd/m2.",
                     "Deliver it graded for SDR, or as scene-linear EXR, if it should look otherwise.",
                 )
             )
@@ -393,7 +396,7 @@ class VideoSource:
             unsaid = ", though it does not say so" if self._fields else ""
             self.warnings.append(_deinterlaced_words(f"The clip is interlaced{unsaid}: each frame"))
         if self.has_alpha:
-            self.warnings.append(("The clip has alpha: its colour is taken, its alpha is not.", ""))
+            self.warnings.append(("The clip has alpha: its colour is used, its alpha is ignored.", ""))
 
 
 @dataclass
@@ -414,8 +417,8 @@ class _Seen:
 
 
 def _deinterlaced_words(which: str) -> tuple[str, str]:
-    message = f"{which} becomes a whole picture of its first field."
-    return message, "Film progressive where you can: half of its lines are interpolated."
+    message = f"{which} is built from its first field."
+    return message, "Film progressive if you can: half of the lines are interpolated."
 
 
 def _reading(frame: av.VideoFrame, space: InputSpace, coding: Coding) -> dict[str, Any]:
@@ -463,7 +466,7 @@ def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> Input
         if not fine:
             warnings.append(
                 (
-                    f"The clip's {what} (number {code} of ITU-T H.273) is not known here: taken as {assumed_as}.",
+                    f"The clip's {what} (number {code} of ITU-T H.273) is unknown: read as {assumed_as}.",
                     "Convert the clip to Rec.709 if the picture looks wrong.",
                 )
             )

@@ -177,8 +177,8 @@ class Lens:
     def _folded(self) -> JobError:
         numbers = ", ".join(f"{v:.3g}" for v in (self.k1, self.k2, self.p1, self.p2) if v)
         return JobError(
-            f"The lens that the solve found ({self.model}, {numbers}) folds over towards the picture's corners: "
-            "there is no way back through it.",
+            f"The lens that the solve found ({self.model}, {numbers}) folds over towards the picture's corners, so "
+            "its distortion cannot be inverted.",
             "Solve the camera again with the other kind of lens.",
             ExitCode.SOLVE,
         )
@@ -197,20 +197,18 @@ def load_lens(shot: Shot) -> Lens | MapLens:
             raise damaged(shot.solve_record, error) from error
     model, extra, focal = record.get("camera_model"), record.get("distortion"), record.get("focal_px")
     if model is None or extra is None or not focal:
-        raise JobError(
-            f"The solve of {shot.root.name} does not tell its lens.", "Solve the camera again.", ExitCode.SOLVE
-        )
+        raise JobError(f"The solve of {shot.root.name} has no lens.", "Solve the camera again.", ExitCode.SOLVE)
     if model not in _EXTRA or len(extra) != len(_EXTRA[model]):
         raise JobError(
-            f"The lens of this solve is {model} with {len(extra)} numbers: there are no maps for it.",
-            f"Known are {', '.join(_EXTRA)}.",
+            f"ST maps do not support the lens of this solve, {model} with {len(extra)} numbers.",
+            f"Supported lenses: {', '.join(_EXTRA)}.",
             ExitCode.SOLVE,
         )
     fx, fy, cx, cy = path.frames[0].K
     if any(abs(a - b) > 1e-3 for frame in path.frames for a, b in zip(frame.K, path.frames[0].K, strict=True)):
         raise JobError(
             "The focal length changes over this clip: no single map fits it.",
-            "The maps are for lenses that do not zoom.",
+            "ST maps need a lens that does not zoom.",
             ExitCode.SOLVE,
         )
     # solve.json stores the mean of fx and fy of the original frames. Undistortion scaled both by the same zoom.

@@ -86,20 +86,19 @@ def refuse_lens(answer: dict[str, Any]) -> None:
     angle = _shown_deg(lens, "view_deg", answer["focal_px"])
     numbers = ", ".join(f"{value:.3g}" for value in answer.get("distortion", []))
     if not LEAST_DEG <= angle <= MOST_DEG and not lens.get("given_px"):
-        message = f"The solve found a lens that no camera has: {angle:.1f} degrees wide ({answer['focal_px']:.0f} px)."
+        message = f"The solve found an impossible lens: {angle:.1f} degrees wide ({answer['focal_px']:.0f} px)."
     elif lens.get("impossible") == "folded":
-        message = (
-            f"The solve found a lens that no camera has: it folds the picture over before its corners ({numbers})."
-        )
+        message = f"The solve found an impossible lens: it folds the picture over before its corners ({numbers})."
     elif lens.get("impossible") == "strong":
-        message = f"The solve found a lens that no camera has: it bends the picture out of all measure ({numbers})."
+        message = f"The solve found an impossible lens: its distortion is far too strong ({numbers})."
     else:
         return
-    hint = (
-        "Choose a longer range, in which the camera travels more; mask what moves by itself, or give the focal length."
-    )
+    hint = "Choose a longer range in which the camera travels more, mask what moves, or set the focal length."
     if answer.get("camera_model") != FISHEYE and like_a_fisheye(answer):
-        hint = f"Choose Fisheye as the lens (--camera-model {FISHEYE}) if it is one. Else: {hint[0].lower()}{hint[1:]}"
+        hint = (
+            f"If the lens is a fisheye, choose Fisheye (--camera-model {FISHEYE}). Otherwise: "
+            f"{hint[0].lower()}{hint[1:]}"
+        )
     raise JobError(message, hint, ExitCode.SOLVE)
 
 
@@ -119,8 +118,9 @@ def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
     if left > LEFT_SHARE * np.hypot(answer["lens"]["width"], answer["lens"]["height"]):
         return [
             (
-                f"Through the ST map the frames are still bent, by {left:.1f} pixels at their corners.",
-                "Is the map of this clip's lens, and the right way round (--st-map-way)?",
+                f"The ST map does not straighten the frames: they are still bent by {left:.1f} pixels at their "
+                "corners.",
+                "Check that the map is for this clip's lens, and its direction (--st-map-way).",
             ),
             *_remarks(answer),
         ]
@@ -141,48 +141,49 @@ def _remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
     if lens["held"] and known_px:
         return [
             (
-                f"The solve would have another focal length than was given ({lens['found_px']:.0f} px instead of "
-                f"{known_px:.0f}): it was held as given.",
-                "Is it for the sensor's width, and was the clip not cropped or stabilised?",
+                f"The solve suggests another focal length ({lens['found_px']:.0f} px instead of {known_px:.0f}), but "
+                "it is kept fixed.",
+                "Check the sensor width, and whether the clip was cropped or stabilised.",
             )
         ]
     if lens["held"]:
         finding = (
-            "found one that folds the picture over" if lens["doubt"] == "bent" else f"ran off to {found:.0f} degrees"
+            "found one that folds the picture over" if lens["doubt"] == "bent" else f"diverged to {found:.0f} degrees"
         )
         if lens.get("start_px"):
             return [
                 (
-                    f"The clip does not tell its lens (the solve {finding}): the one that the file names was taken, "
-                    f"{used:.0f} degrees wide.",
-                    "Was the clip cropped or stabilised? Then it is narrower.",
+                    f"The lens cannot be estimated from this clip (the solve {finding}): the lens stated in the file "
+                    f"is used, {used:.0f} degrees wide.",
+                    "If the clip was cropped or stabilised, the real lens is narrower.",
                 )
             ]
         return [
             (
-                f"The clip does not tell its lens (the solve {finding}): a usual one of {used:.0f} degrees was taken.",
-                "Depth may look stretched; a range in which the camera travels more tells the lens.",
+                f"The lens cannot be estimated from this clip (the solve {finding}): a typical lens of {used:.0f} "
+                "degrees is used.",
+                "Depth may look stretched. A range in which the camera travels more helps to estimate the lens.",
             )
         ]
     if lens["doubt"] == "off":
         return [
             (
-                f"The focal length came out as {lens['found_px']:.0f} px, and {known_px:.0f} were given.",
-                "Is it for the sensor's width, and was the clip not cropped or stabilised?",
+                f"The solved focal length is {lens['found_px']:.0f} px, but {known_px:.0f} px was set.",
+                "Check the sensor width, and whether the clip was cropped or stabilised.",
             )
         ]
     if lens["doubt"] == "bent":
         return [
             (
-                "The lens that the solve found bends the picture more than lenses do.",
-                "Try the other camera model; a range in which the camera travels more tells the lens.",
+                "The distortion of the solved lens is unusually strong.",
+                "Try the other camera model, or a range in which the camera travels more.",
             )
         ]
     if lens["doubt"]:
         return [
             (
-                f"The lens that the solve found is unusual: {used:.0f} degrees wide.",
-                "If yours is not, choose a range in which the camera travels more.",
+                f"The solved lens is unusual: {used:.0f} degrees wide.",
+                "If your lens differs, choose a range in which the camera travels more.",
             )
         ]
     return []

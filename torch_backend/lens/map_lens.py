@@ -149,7 +149,7 @@ class MapLens:
         forward, degree = (int(value) for value in values[:2])
         terms = tuple(values[8:])
         if forward not in (0, 1) or not 0 <= degree < 100 or len(terms) != (degree + 1) * (degree + 2):
-            raise ValueError(f"{len(values)} numbers of an ST map's lens are not its degree's")
+            raise ValueError(f"{len(values)} numbers of an ST map's lens do not match its degree")
         bend = Polynomial(degree, (values[4], values[5], values[6], values[7]), terms)
         return cls(width, height, bend, bool(forward), (values[2], values[3]), (K[0], K[1], K[2], K[3]))
 
@@ -300,8 +300,8 @@ def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) ->
     low, high = _LEAST_WINDOW, _MOST_WINDOW
     if not inside(low):
         raise JobError(
-            "The ST map leaves no part of the picture that is whole.",
-            "Is it of this lens? The other way round is --st-map-way.",
+            "The ST map leaves no usable part of the picture.",
+            "Check that it is for this lens, and its direction (--st-map-way).",
             ExitCode.SOLVE,
         )
     for _ in range(40):
@@ -321,7 +321,7 @@ def _border_points(width: int, height: int) -> NDArray[np.float64]:
 
 def _folded() -> JobError:
     return JobError(
-        "The lens of the ST map folds over towards the picture's corners: there is no way back through it.",
-        "Ask for a map with overscan, or for the one of the other way round (--st-map-way), which may reach farther.",
+        "The lens of the ST map folds over towards the picture's corners, so its distortion cannot be inverted.",
+        "Use a map with overscan, or the map for the other direction (--st-map-way), which may cover more.",
         ExitCode.SOLVE,
     )

@@ -103,17 +103,17 @@ def read_lens(path: str, way: str, layer: str, frames: dict[str, Any], report: R
     undistorted, original = _samples(read, way, name, report)
     if read.rounding * scale.max() > ROUGH_PX:
         report.warning(
-            f"{name} has 16-bit floats, whose steps are up to {read.rounding * float(scale.max()):.1f} pixels of this "
+            f"{name} has 16-bit floats, with steps of up to {read.rounding * float(scale.max()):.1f} pixels of this "
             "footage: it is smoothed.",
-            "Ask for 32 bits.",
+            "Export it with 32 bits.",
         )
     found = _fit(undistorted, original, read, scale)
     if found.errors.max() > ROUGH_PX + 2.0 * read.rounding * scale.max():
         worst = (undistorted if way == UNDISTORT else original)[int(found.errors.argmax())] * read.size
         raise _refused(
-            f"{name} is no smooth map of a lens: at column {worst[0]:.0f}, row {worst[1]:.0f} it is "
-            f"{found.errors.max():.2f} pixels off from what is around it.",
-            "Write it as an uncompressed or zip-compressed EXR of 32 bits, of the lens alone, without stabilising.",
+            f"{name} is not a smooth map of a lens: at column {worst[0]:.0f}, row {worst[1]:.0f} it differs by "
+            f"{found.errors.max():.2f} pixels from its surroundings.",
+            "Export only the lens, without stabilisation, as an uncompressed or zip-compressed 32-bit EXR.",
         )
     _check_bend(found, name, scale, read.rounding, report)
     aspect = float(frames.get("reading", {}).get("pixel_aspect", 1.0))
@@ -135,8 +135,8 @@ def _read(path: Path, layer: str, name: str) -> _Map:
     """Reads the two channels and the mask of valid pixels. Raises JobError (USAGE) as `read_lens` does."""
     opened = oiio.ImageInput.open(regular_file(path)) if path.is_file() else None
     if opened is None:
-        why = error_of() if path.is_file() else "it is not there"
-        raise _refused(f"{name} cannot be read: {why.rstrip('.')}.", "Name an EXR file.")
+        why = error_of() if path.is_file() else "it does not exist"
+        raise _refused(f"{name} cannot be read: {why.rstrip('.')}.", "Choose an EXR file.")
     try:
         part, channels, alpha = _channels(opened, layer, name)
         opened.seek_subimage(part, 0)
@@ -145,15 +145,17 @@ def _read(path: Path, layer: str, name: str) -> _Map:
         kind = str(spec.format)
         if kind not in ("float", "half", "double", "uint16", "uint") or bits <= 12:
             raise _refused(
-                f"{name} has {bits} bits a channel, which cannot tell places in a picture to less than a pixel.",
-                "Write it as an EXR of 32 bits.",
+                f"{name} has {bits} bits per channel, which is too coarse for positions within a pixel.",
+                "Export it as a 32-bit EXR.",
             )
         check_size(name, spec)
         if max(spec.full_width, spec.full_height, spec.width, spec.height) > _LARGEST:
-            raise _refused(f"{name} is {spec.full_width} x {spec.full_height}.", f"Choose up to {_LARGEST} a side.")
+            raise _refused(
+                f"{name} is {spec.full_width} x {spec.full_height}.", f"Use at most {_LARGEST} pixels per side."
+            )
         pixels = opened.read_image(part, 0, 0, spec.nchannels, oiio.FLOAT)
         if pixels is None:
-            raise _refused(f"{name} cannot be read: {error_of(opened)}.", "Write it again.")
+            raise _refused(f"{name} cannot be read: {error_of(opened)}.", "Export it again.")
     finally:
         opened.close()
     pixels = np.asarray(pixels, np.float64).reshape(spec.height, spec.width, -1)
@@ -162,9 +164,10 @@ def _read(path: Path, layer: str, name: str) -> _Map:
     if invalid.any():
         row, column = np.argwhere(invalid)[0]
         raise _refused(
-            f"{name} holds {int(invalid.sum())} pixels that are no numbers (NaN), the first at column {column}, "
-            f"row {row}.",
-            "Write it without holes: 0 in both channels says that there is nothing.",
+            f"{name} contains {int(invalid.sum())} pixels that are not numbers (NaN), the first at column {column}, "
+            f"row "
+            f"{row}.",
+            "Export it without them: 0 in both channels marks an empty pixel.",
         )
     known = (s != 0.0) | (t != 0.0)
     if alpha is not None:
@@ -202,7 +205,7 @@ def _channels(opened: oiio.ImageInput, layer: str, name: str) -> tuple[int, tupl
         raise _refused(f"{name} has no layer {layer!r} with two channels of coordinates.", f"It has: {names}.")
     plain = [x for x in matching if not x[0]] if not layer_name else [x for x in matching if x[0] == layer_name]
     if len(matching) > 1 and len(plain) != 1:
-        raise _refused(f"{name} has several layers that may be meant: {names}.", "Choose one: --st-map-layer.")
+        raise _refused(f"{name} has several layers that could be the map: {names}.", "Choose one: --st-map-layer.")
     chosen = (plain or matching)[0]
     return chosen[1], chosen[2], chosen[3]
 
@@ -223,27 +226,30 @@ def _samples(read: _Map, way: str, name: str, report: Reporter) -> tuple[NDArray
     valid = known & ((points > 0.0) & (points < 1.0)).all(1)
     if valid.sum() < _LEAST_SHARE * ((points > 0.0) & (points < 1.0)).all(1).sum() or valid.sum() < 100:
         raise _refused(
-            f"{name} has coordinates in {100 * float(valid.mean()):.0f} % of its picture only.",
-            "Is it an ST map? Red should grow from left to right, green from the bottom to the top.",
+            f"{name} has coordinates in only {100 * float(valid.mean()):.0f} % of its picture.",
+            "Check that it is an ST map: red should grow from left to right, green from bottom to top.",
         )
     slope = fitted(points[valid], values[valid], 1, (0.0, 0.0, 1.0, 1.0)).slopes(np.array([[0.5, 0.5]]))[0]
     across, down = float(slope[0, 0]), float(slope[1, 1])
     if max(abs(float(slope[0, 1])), abs(float(slope[1, 0]))) > min(abs(across), abs(down)):
-        raise _refused(f"{name} has s and t in each other's place, or is turned.", "Red is s, green is t.")
+        raise _refused(f"{name} has s and t swapped, or is rotated.", "Red should be s, and green t.")
     if abs(across) < 0.25 or abs(down) < 0.25:
         raise _refused(
-            f"{name} holds no places: red grows by {across:.3f} from left to right, where about 1 is expected.",
-            "Displacements are no ST map: add each pixel's own place, (x + 0.5) / width and (y + 0.5) / height.",
+            f"{name} contains no coordinates: red grows by {across:.3f} from left to right, but about 1 is expected.",
+            "If it stores displacements, add each pixel's own position, (x + 0.5) / width and (y + 0.5) / height.",
         )
     if across < 0.0:
-        raise _refused(f"{name} is mirrored: its red falls from left to right.", "Flip it, and the footage alike.")
+        raise _refused(
+            f"{name} is mirrored: its red falls from left to right.", "Flip it, and the footage in the same way."
+        )
     if across > 8.0 or abs(down) > 8.0:
         raise _refused(
-            f"{name} holds pixels (up to {float(np.abs(values[valid]).max()):.0f}), not shares of the picture.",
-            "Divide red by the width and green by the height of the picture that is looked into.",
+            f"{name} contains pixels (up to {float(np.abs(values[valid]).max()):.0f}) instead of coordinates from 0 to "
+            "1.",
+            "Divide red by the width and green by the height of the source picture.",
         )
     if down > 0.0:
-        report.warning(f"{name} counts t from the top: it is taken so.")
+        report.warning(f"{name} counts t from the top, and is read that way.")
     else:
         values[:, 1] = 1.0 - values[:, 1]
     if way == REDISTORT:
@@ -313,9 +319,9 @@ def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: fl
     if not determinants.min() > 0.0:
         worst = 100.0 * grid[int(determinants.argmin())]
         raise _refused(
-            f"{name} folds over: at {worst[0]:.0f} % of the width and {worst[1]:.0f} % of the height two of its pixels "
-            "look at one place.",
-            "It is no map of a lens there: write it with less overscan, or with 0 in both channels there.",
+            f"{name} folds over: at {worst[0]:.0f} % of the width and {worst[1]:.0f} % of the height, two of its "
+            "pixels point to the same place.",
+            "Export it with less overscan, or with 0 in both channels there.",
         )
     at, seen = (grid - 0.5) * scale, (found.bend(grid) - 0.5) * scale
     plain = np.concatenate([at, np.ones((len(at), 1))], 1)  # inputs of an affine fit
@@ -325,10 +331,10 @@ def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: fl
     shift = affine[2] if found.forward else -affine[2]
     if np.abs(shift).max() > 2.0 * STRAIGHT_PX + 0.5 * rounding * scale.max():
         raise _refused(
-            f"{name} bends nothing, but moves the whole picture by {shift[0]:.2f} and {shift[1]:.2f} pixels.",
-            "A pixel's centre is at (i + 0.5) / size; from i / size everything lies half a pixel off.",
+            f"{name} has no distortion, but moves the whole picture by {shift[0]:.2f} and {shift[1]:.2f} pixels.",
+            "A pixel's centre is at (i + 0.5) / size: with i / size, everything is off by half a pixel.",
         )
-    report.warning(f"{name} bends nothing: the footage is taken to be without a lens.")
+    report.warning(f"{name} has no distortion: the footage is treated as undistorted.")
 
 
 def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect: float, name: str) -> float:
@@ -351,9 +357,8 @@ def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect:
     best = min(fits, key=lambda map_shape: abs(math.log(fits[map_shape])), default=None)
     if best is None or abs(math.log(fits[best])) > SHAPE:
         raise _refused(
-            f"{name} is {width} x {height}, the footage {source[0]} x {source[1]}: it is of a picture of another "
-            "shape.",
-            "Ask for the map at the footage's size; overscan may come on top of that.",
+            f"{name} is {width} x {height}, the footage {source[0]} x {source[1]}: their aspect ratios differ.",
+            "Use a map at the footage's size, with overscan added if needed.",
         )
     return best
 
@@ -366,9 +371,9 @@ def _warn_uncovered(lens: MapLens, known: tuple[Any, ...], name: str, report: Re
     lost = ((at < np.array(known[:2]) - pixel) | (at > np.array(known[2:]) + pixel)).any(1)
     if lost.any():
         report.warning(
-            f"{name} ends before the original picture does ({100 * float(lost.mean()):.0f} % of it is not in the map): "
-            "there the way back is continued from what is.",
-            "A map with overscan, or the one of the other way round (--st-map-way redistort), tells it.",
+            f"{name} does not cover the whole original picture ({100 * float(lost.mean()):.0f} % of it is missing): "
+            "the inverse is extrapolated there.",
+            "Use a map with overscan, or the map for the other direction (--st-map-way redistort).",
         )
 
 

@@ -92,17 +92,17 @@ def margin(shot: Shot, params: FreezeParams, width: int, height: int, Ks: NDArra
         lens = load_lens(shot)
         if not same_camera(lens, width, height, Ks):
             raise JobError(
-                "What the lens needs beyond the frame is known for the clip's own camera only, "
-                "and this path has another focal length or shape.",
-                "Give the camera the lens of the solved one and the clip's size, or switch overscan off.",
+                "The overscan that the lens needs is only known for the clip's own camera, but this path has another "
+                "focal length or aspect ratio.",
+                "Use the lens of the solved camera and the clip's size, or switch overscan off.",
                 ExitCode.USAGE,
             )
         lens.check()
         found = needed_margin(lens, width, height)
         if found[0] > width or found[1] > height:
             raise JobError(
-                f"The way back through the lens needs {found[0]} x {found[1]} pixels beyond a frame of "
-                f"{width} x {height}: that is no lens.",
+                f"Adding the lens distortion back needs {found[0]} x {found[1]} pixels beyond a frame of {width} x "
+                f"{height}, which no real lens does.",
                 "Solve the camera again with the other kind of lens.",
                 ExitCode.SOLVE,
             )

@@ -109,12 +109,12 @@ def zoom_words(changes: Mapping[int, float]) -> tuple[str, str] | None:
         return None
     first, last = _steady(smooth)
     percent = round(100 * (np.exp(whole) - 1.0))
-    hint = f"Import frames {frames[first]} to {frames[last]}, in which it does not, or film without zooming."
+    hint = f"Import frames {frames[first]} to {frames[last]}, in which it does not zoom, or film without zooming."
     if last - first + 1 < _LEAST_FRAMES:
         hint = "Film without zooming, or choose a range in which it does not."
     return (
-        f"The lens zooms: its focal length changes by {percent} % or more during the take, and this solve has one for "
-        "all frames. Its path is wrong, however small its error is.",
+        f"The lens zooms: its focal length changes by {percent} % or more during the take, but this solve has one "
+        "for all frames. The camera path is wrong, even if its error is small.",
         hint,
     )
 

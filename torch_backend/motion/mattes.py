@@ -143,7 +143,9 @@ def _painted(path: Path, found: NDArray[np.uint8] | None, size: tuple[int, int])
     pixels = _decoded(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype.type not in (np.uint8, np.uint16):
         raise JobError(
-            f"The painted motion matte {path} is damaged or no PNG.", "Paint it again, or remove it.", ExitCode.FOOTAGE
+            f"The painted motion matte {path} is damaged, or not a PNG.",
+            "Paint it again, or remove it.",
+            ExitCode.FOOTAGE,
         )
     scale = 255.0 / np.iinfo(pixels.dtype).max
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels

@@ -59,8 +59,9 @@ def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = Fals
         report.check_cancelled()  # the launcher cancels by Ctrl-Break on Windows, which also reaches COLMAP
         need_disk(log.parent, _FULL_BYTES, "The camera solve")
         raise JobError(
-            f"The camera solve broke off (COLMAP ended with code {code}): {_tail(log, start)}",
-            f"Try again with a shorter range or a smaller working height; if it stays, please report it with {log}.",
+            f"The camera solve failed (COLMAP ended with code {code}): {_tail(log, start)}",
+            "Try again with a shorter range or a smaller working height. If that does not help, please report it "
+            f"with {log}.",
             ExitCode.SOLVE,
         )
     return answer

@@ -156,10 +156,10 @@ def refuse_misfit(answer: dict[str, Any], usable: int) -> None:
     """Raises JobError for imported cameras that leave too few (`usable`) points to train from."""
     agreement = answer.get("agreement", 1.0)
     if usable < LEAST_POINTS or agreement < LEAST_AGREEMENT:
-        share = f", and {100 * agreement:.0f} % of what was matched" if "agreement" in answer else ""
+        share = f", and {100 * agreement:.0f} % of the matches" if "agreement" in answer else ""
         raise JobError(
-            f"The given cameras do not fit these frames: only {usable} points of the scene{share} agree with them.",
-            "Are they of this clip and its lens, and numbered as its frames are?",
+            f"The imported cameras do not fit these frames: only {usable} points of the scene{share} agree with them.",
+            "Check that they are for this clip and its lens, and numbered like its frames.",
             ExitCode.SOLVE,
         )
     refuse_narrow(answer["triangulation_angle_deg"])
@@ -172,8 +172,8 @@ def doubts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     share = f"{100 * answer['agreement']:.0f} %"
     return [
         (
-            f"Only {share} of what was matched between the frames agrees with the given cameras.",
-            "Are they of this clip and its lens, and numbered as its frames are?",
+            f"Only {share} % of the matches between frames agree with the imported cameras.",
+            "Check that they are for this clip and its lens, and numbered like its frames.",
         )
     ]
 

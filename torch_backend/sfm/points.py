@@ -34,7 +34,9 @@ def filter_points(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> dic
 
 def narrow_words(angle_deg: float) -> str:
     """Sentence that the triangulation angle, median in degrees, is too small for depth."""
-    return f"The camera moves too little for depth: half of the points are seen under {angle_deg:.1f} degrees or less."
+    return (
+        f"The camera moves too little for depth: the parallax of half of the points is {angle_deg:.1f} degrees or less."
+    )
 
 
 def refuse_narrow(angle_deg: float) -> None:

@@ -271,7 +271,7 @@ def _warnings(
         warnings.append(
             (
                 f"The mapper did not register {len(lost)} solved frames: {frame_words(lost)}.",
-                "Their cameras are placed from their neighbours.",
+                "Their cameras are interpolated from their neighbours.",
             )
         )
     guessed = [i for i, camera in enumerate(path.frames) if camera.source == "interpolated"]
@@ -280,11 +280,11 @@ def _warnings(
     if clamped:
         warnings.append(
             (
-                f"The camera holds its pose in {frame_words(clamped)}, beyond the last frame that was placed.",
-                "Cut them off.",
+                f"The camera holds its pose before the first or after the last solved frame: {frame_words(clamped)}.",
+                "Leave these frames out of the range.",
             )
         )
     if result["reprojection_error_px"] > FAIR_ERROR_PX:
-        hint = "Are they of this clip and its lens?" if is_imported else "Try the OPENCV camera model."
+        hint = "Check that they are for this clip and its lens." if is_imported else "Try the OPENCV camera model."
         warnings.append(("The reprojection error is high: the picture will be soft.", hint))
     return warnings

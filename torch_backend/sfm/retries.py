@@ -115,7 +115,7 @@ def solve_with_retries(
         now = {**current, **strategy.changes}
         current = now if strategy.stays else current
         fresh = "features" in strategy.changes
-        need_disk(scratch, len(frames["frames"]) << 21, "Another try of the camera solve")
+        need_disk(scratch, len(frames["frames"]) << 21, "Retrying the camera solve")
         try:
             attempt = _attempt(strategy.name, now, frames, None if fresh else last, scratch, log, report)
         except JobError as error:  # COLMAP crashed: the best attempt so far stays
@@ -142,13 +142,13 @@ def next_strategy(best: Attempt, request: dict[str, Any], done: set[str]) -> Str
         return None
     more = round(MORE_FEATURES * request["features"])
     features = Strategy(
-        "features", f"up to {more} features a frame, faint ones too", {"features": more, "peak": FAINT_PEAK}
+        "features", f"up to {more} features per frame, including faint ones", {"features": more, "peak": FAINT_PEAK}
     )
     pairs = None if request.get("wide") else Strategy("pairs", "more frames matched with each other", {"wide": True})
     mapper = Strategy("global", "all cameras placed at once (global mapper)", {"mapper": "global"})
     free: list[Strategy | None] = [None]
     if request.get("start_focal_px") and not request.get("focal_px"):
-        free = [Strategy("focal", "no focal length to begin with (the file's may be of the whole sensor)", NO_FOCAL)]
+        free = [Strategy("focal", "no initial focal length (the file's may be for the whole sensor)", NO_FOCAL)]
     if "failure" in best.answer:
         strategies = [*free, features, pairs]
     elif fault.kind == "bent":
@@ -166,10 +166,10 @@ def _lens_strategy(best: Attempt, request: dict[str, Any]) -> Strategy | None:
     if model == FISHEYE or request.get("hold_bend") or "failure" in best.answer:
         return None
     if like_a_fisheye(best.answer["result"]):
-        return Strategy("lens", "the lens of a fisheye (OPENCV_FISHEYE)", {"camera_model": FISHEYE}, stays=False)
+        return Strategy("lens", "a fisheye lens (OPENCV_FISHEYE)", {"camera_model": FISHEYE}, stays=False)
     if model == "OPENCV":
         return None
-    return Strategy("lens", "a lens that may bend more (OPENCV)", {"camera_model": "OPENCV"}, stays=False)
+    return Strategy("lens", "a lens with more distortion (OPENCV)", {"camera_model": "OPENCV"}, stays=False)
 
 
 def _attempt(
@@ -197,7 +197,7 @@ def _row(strategy: str, found: str) -> dict[str, str]:
 
 
 _HELPED = {
-    "focal": "no focal length to begin with",
+    "focal": "no initial focal length",
     "features": "more features",
     "pairs": "more pairs",
     "lens": "another lens model",
@@ -211,4 +211,4 @@ def _refusal(error: JobError, strategies: list[str]) -> JobError:
     if not tried:
         return error
     listed = " and ".join([", ".join(tried[:-1]), tried[-1]] if len(tried) > 1 else tried)
-    return JobError(error.message, f"{error.hint} Tried in vain: {listed}.".strip(), error.exit_code)
+    return JobError(error.message, f"{error.hint} Tried without success: {listed}.".strip(), error.exit_code)

@@ -145,7 +145,9 @@ def _solved_anew(inputs: SolveInputs, config: SolveConfig, cameras: str, report:
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     if had_maps:
-        report.warning("The ST maps of the solve before were of its lens: they are gone.", "Write them again.")
+        report.warning(
+            "The ST maps of the previous solve were for its lens and have been removed.", "Write them again."
+        )
     return result
 
 
@@ -224,8 +226,8 @@ def _log_end(log: Path) -> str:
 def _check(config: SolveConfig, cameras: str) -> None:
     if config.st_map and cameras:
         raise JobError(
-            "Cameras from elsewhere bring their own lens: an ST map beside them would be a second one.",
-            "Give one of the two.",
+            "Imported cameras already have a lens, so they cannot be used with an ST map.",
+            "Use only one of the two.",
             ExitCode.USAGE,
         )
     if config.st_map_way not in ST_MAP_WAYS:

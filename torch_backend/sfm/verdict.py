@@ -27,7 +27,7 @@ still does not start, the cause is a lack of parallax."""
 MUCH_MOVES = 0.2
 """Share of independently moving pixels above which a clip's cameras are doubted. Correct solves had 0.02 to 0.08. A
 solve that started from a pair without parallax had 0.31, at an error of 0.9 pixels."""
-_TURNING = "The camera only turns on the spot: there is nothing to tell depth by."
+_TURNING = "The camera only turns on the spot, so depth cannot be estimated."
 _RANGE_HINT = "Import a longer range, in which the camera moves sideways by a step or more."
 _BARE_HINT = "Choose a sharper range, or film with more light and texture in view."
 
@@ -40,10 +40,10 @@ def doubt_of(moving: float) -> tuple[str, str] | None:
     if moving < MUCH_MOVES:
         return None
     return (
-        f"By these cameras {round(100 * moving)} % of the pictures move by themselves: where people hold still, the "
-        "cameras are wrong, however small their error is.",
-        "Look at a few frozen frames. If what stands still slides in them, import a range in which the camera goes "
-        "another way, or mask those who walk, and solve again.",
+        f"With these cameras, {round(100 * moving)} % of the picture seems to move. If people hold still, the "
+        "cameras are wrong, even if their error is small.",
+        "Check a few frozen frames. If static things slide in them, mask people who walk, or import a range with "
+        "another camera path, and solve again.",
     )
 
 
@@ -86,14 +86,14 @@ def fault_of(answer: dict[str, Any], frames: dict[str, Any]) -> Fault | None:
             words, hint = f"{short}: {words[0].lower()}{words[1:]}", _RANGE_HINT
         return _fault("narrow", words, hint)
     if found["points"] < LEAST_POINTS:
-        why = _smeared_words(solved, set()) or "the clip is too blurred or too bare"
+        why = _smeared_words(solved, set()) or "the clip is too blurred or has too little texture"
         return _fault("bare", f"Only {found['points']} points of the scene could be placed: {why}.", _BARE_HINT)
     words = quality_words(registered, len(solved), float(found["reprojection_error_px"]))
     if words.startswith("Poor"):
         return _fault("poor", words, "")
     lens = found["lens"]
     if lens.get("held") and lens.get("doubt") == "bent":
-        return _fault("bent", "The lens came out as one that folds the picture over, and a usual one was taken.", "")
+        return _fault("bent", "The solved lens folds the picture over, so a typical lens is used.", "")
     return None
 
 
@@ -113,7 +113,7 @@ def quality_words(
     else:
         word = "Fair" if share >= FAIR_SHARE and error_px <= FAIR_ERROR_PX else "Poor"
     if is_imported:
-        return f"{word}: cameras given for {registered} of {solved} frames, {error_px:.2f} px."
+        return f"{word}: cameras imported for {registered} of {solved} frames, {error_px:.2f} px."
     return f"{word}: {registered} of {solved} frames registered, {error_px:.2f} px."
 
 
@@ -134,8 +134,8 @@ def _failure(answer: dict[str, Any], frames: dict[str, Any]) -> Fault:
     if answer["failure"] == "bare":
         return _fault(
             "bare",
-            f"The frames show too little to match: about {answer['features']} spots of a frame stand out, and no two "
-            "frames have 15 in common.",
+            f"The frames show too little to match: a frame has about {answer['features']} distinct features, and no "
+            "two frames have 15 in common.",
             _BARE_HINT,
         )
     smeared = _smeared_words([f for f in frames["frames"] if f["solve"]], set())
@@ -205,7 +205,7 @@ def _span_words(spans: list[tuple[int, int, int]]) -> str:
 def _range_hint(parts: list[list[tuple[int, int, int]]], solved: list[int], step: int) -> str:
     """Hint that suggests the longest range that worked and, if the step is above 1, a smaller step."""
     best = max((span for part in parts for span in part), key=lambda span: span[2], default=(0, 0, 0))
-    smaller = " A smaller step shows more of each to the next." if step > 1 else ""
+    smaller = " A smaller step makes neighbouring frames overlap more." if step > 1 else ""
     if best[2] < LEAST_REGISTERED or best[2] == len(solved):
         return f"Choose a range without fast pans or blur.{smaller}"
     return f"Frames {best[0]} to {best[1]} worked: import that range, or one without fast pans or blur.{smaller}"

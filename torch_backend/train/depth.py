@@ -192,7 +192,7 @@ def fitted_depth(
         raise JobError(
             f"The depth sequence {sequence.source} does not fit the solve: at the best scale and shift points are off "
             f"by {100 * fit.residual:.0f} %, and {100 * fit.unexplained:.0f} % of what it shows is not in the solve.",
-            "Check that it is of this clip and numbered as its frames, or train without it.",
+            "Check that it is for this clip and numbered like its frames, or train without it.",
             ExitCode.TRAIN,
         )
     fitted = _fitted(sequence, maps, fit, key, len(frames), config)
@@ -212,14 +212,14 @@ def load_fitted(folder: Path, key: str, config: DepthConfig | None = None) -> Fi
         facts = meta["facts"]
         is_valid = inverse.dim() == 3 and inverse.dtype == torch.float16 and len(frames) == len(sigma) == len(inverse)
         if not is_valid or not is_json_object(facts) or facts.get("key") != key:
-            raise ValueError("it is of another training")
+            raise ValueError("it belongs to another training")
         return FittedDepth(
             integers(frames), inverse, floats(sigma), facts,
             config or DepthConfig(),
         )  # fmt: skip
     except (JobError, OSError, ValueError, KeyError) as error:
         raise JobError(
-            f"The depth of the run's frames, {path}, is missing, damaged or of another training.",
+            f"The depth of the run's frames, {path}, is missing, damaged or from another training.",
             "Train it again, with the same depth sequence.",
             ExitCode.TRAIN,
         ) from error

@@ -13,8 +13,8 @@ from .self_test import SelfTest, card_verdict
 
 _HINT = "Choose --device cpu, or auto."
 _REPORT = (
-    "Update the NVIDIA driver; if it stays, `python3 splannequin.py doctor --gpu` tests the card again and writes what "
-    "it found to a file that you can send."
+    "Update the NVIDIA driver. If that does not help, run `python3 splannequin.py doctor --gpu`: it tests the card "
+    "again and writes a report that you can send."
 )
 
 
@@ -32,13 +32,13 @@ def choose_device(requested: str, report: Reporter | None = None, doing: str = "
         report.warning(*unused_warning(unused, doing))
     if report is not None and device.type == "cuda" and planes_cuda.refused:
         report.warning(
-            f"{doing} computes what moves with PyTorch's own operators, which takes longer: the graphics card failed "
-            f"that part of its self-test ({planes_cuda.refused}).",
+            f"{doing} computes motion with PyTorch's own operators, which is slower: the graphics card failed that "
+            f"part of its self-test ({planes_cuda.refused}).",
             _REPORT,
         )
     if report is not None and device.type == "cuda" and recorder.refused and doing == "Training":
         report.warning(
-            "Training launches every kernel by itself, which takes longer: the graphics card failed that part of its "
+            "Training launches every kernel separately, which is slower: the graphics card failed that part of its "
             f"self-test ({recorder.refused}).",
             _REPORT,
         )
@@ -75,7 +75,7 @@ def unused_warning(unused: tuple[str, str], doing: str) -> tuple[str, str]:
 def cuda_refusal() -> str:
     """Reason why no NVIDIA GPU can be used, as a sentence; empty if one can be used."""
     if torch.version.hip is not None:
-        return "This PyTorch is built for AMD GPUs, which the rasteriser has no body for."
+        return "This PyTorch is built for AMD GPUs, which the rasteriser does not support."
     if not torch.cuda.is_available():
         reason = why_unused(torch.version.cuda)
         return reason[0] if reason else "PyTorch sees no NVIDIA GPU."

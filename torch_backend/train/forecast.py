@@ -125,7 +125,7 @@ def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternat
     sentence = f"The training takes about {long} on the processor."
     if resumed:
         sentence = f"The training takes about {long} more on the processor."
-    less = "A smaller width or fewer Gaussians take less."
+    less = "To make it faster, reduce the width or the number of Gaussians."
     if smaller:
         alternative = next((row for row in smaller if row.seconds <= LONG_SECONDS), smaller[-1])
         takes = duration(alternative.seconds)
@@ -133,5 +133,5 @@ def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternat
         # At the same width, the preset only saves steps; on a clip 640 pixels wide, the extra steps gained nothing.
         if alternative.width >= width:
             less = f"The preset {alternative.preset} would take about {takes} on pictures of the same size."
-    kept = "It can be paused at any time and goes on where it stopped."
+    kept = "It can be paused at any time and continues where it stopped."
     return sentence, f"{kept} {less}"

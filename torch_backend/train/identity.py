@@ -41,8 +41,8 @@ def requested_identity(
     if finished(run, alternative_key) is None:
         device_name = "the processor" if on_card else "a graphics card"
         report.warning(
-            f"The run was begun with the preset's numbers for {device_name}: it goes on with them.",
-            "Train it with --restart, or another run, for those of this device.",
+            f"The run was started with the preset's settings for {device_name}, and continues with them.",
+            "To use those for this device, train it with --restart, or train another run.",
         )
     return alternative, alternative_key, alternative_motion
 

@@ -68,7 +68,7 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
         if stamp == _stamp(checkpoint):  # otherwise the checkpoint was replaced while it was read
             break
     else:
-        message = f"The run {name!r} is written again and again while it is read."
+        message = f"The run {name!r} keeps changing while it is read."
         raise JobError(message, "Wait for its training to end.", ExitCode.FREEZE)
     if meta.get("solve") != solve_key(shot):
         message = f"The run {name!r} was trained on other cameras than the shot has now."

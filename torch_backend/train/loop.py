@@ -149,26 +149,26 @@ class TrainingLoop:
         moving = len(trainer.model.open_rows())
         if min(trainer.model.pieces or moving, moving) > memory.LEAST_PIECE:
             trainer.pieces = trainer.model.pieces = min(trainer.model.pieces or moving, moving) // 2
-            done = f"what moves is computed in pieces of {trainer.pieces}"
+            done = f"motion is computed in pieces of {trainer.pieces}"
         else:
             kept = min(round(0.8 * before), trainer.most or before)
             if kept < memory.LEAST:
                 raise JobError(
                     f"The graphics card has too little memory for step {trainer.iteration} with {before} Gaussians.",
-                    "Close other programs that use the card, choose a smaller width, or train on the processor; what "
-                    "is trained so far is kept.",
+                    "Close other programs that use the card, choose a smaller width, or train on the processor; the "
+                    "training so far is kept.",
                     ExitCode.TRAIN,
                 )
             rows = covering(model, kept)
             model.rebuild(rows, torch.zeros(kept, dtype=torch.bool, device=trainer.device), trainer.optimizer)
             trainer.densifier.reset(kept)
-            done = f"the {before - kept} of {before} Gaussians that cover least were dropped"
+            done = f"the {before - kept} of {before} Gaussians that cover least were removed"
         trainer.most = len(model)
         trainer.densifier.config = trainer.densify_config()
         trainer.report.warning(
-            f"The graphics card ran out of memory at step {trainer.iteration}: {done}, and no more are made. "
-            "Training goes on.",
-            "Other programs that use the card, closed, would leave it more; so would a smaller width.",
+            f"The graphics card ran out of memory at step {trainer.iteration}: {done}, and no more are added. "
+            "Training continues.",
+            "To free memory, close other programs that use the card, or choose a smaller width.",
         )
 
     def _save(self) -> None:

@@ -112,7 +112,7 @@ def plan_memory(
             text = (
                 ""
                 if is_single_call
-                else f"{_shortage(budget, size, free)}: what moves is computed in pieces, which takes longer."
+                else f"{_shortage(budget, size, free)}: motion is computed in pieces, which is slower."
             )
             return MemoryPlan(budget, pieces, on_card, text)
     base = peak_bytes(config, pixels, bins, 0)
@@ -128,7 +128,7 @@ def plan_memory(
         )
     return MemoryPlan(
         fewer, PIECE if moves else None, False,
-        f"{_shortage(budget, size, free)}: there will be {fewer:,} at most, which shows less detail. To have them all, "
+        f"{_shortage(budget, size, free)}: at most {fewer:,} are used, which shows less detail. To use all of them, "
         "close other programs that use the card, choose a smaller width, or train on the processor.",
     )  # fmt: skip
 

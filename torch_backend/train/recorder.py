@@ -124,7 +124,7 @@ class Recorder:
 
     def disable(self) -> bool:
         """Switches recording off after GPU memory ran out. Returns True if this freed the memory of a recording."""
-        has_recordings, self.refused = bool(self._recorded), "the memory of the graphics card ended"
+        has_recordings, self.refused = bool(self._recorded), "the graphics card ran out of memory"
         self.forget()
         return has_recordings
 

@@ -157,8 +157,8 @@ class FieldMemory:
         for group in optimizer.param_groups:
             if any(id(p) in owned for p in group["params"]):
                 group["lr_start"], group["lr_end"] = 0.5 * group["lr_start"], 0.5 * group["lr_end"]
-        share = f"{100.0 * worst:.0f} % of what moves"
-        return f"put the field back to what it was, at half the learning rates ({share} was thrown out of its place)"
+        share = f"{100.0 * worst:.0f} % of the moving Gaussians"
+        return f"restored the field, at half the learning rates ({share} had jumped away)"
 
 
 @torch.no_grad()
@@ -178,14 +178,14 @@ def repair(
         bad, before = ~torch.isfinite(p), memory.of(name, p)
         if bool(bad.any()):
             sound = p[~bad]
-            messages.append(f"mended {_counted(int(bad.sum()), 'number')} of {name}")
+            messages.append(f"repaired {_counted(int(bad.sum()), 'number')} of {name}")
             _mend(p, bad, before if before is not None else sound.median() if len(sound) else 0.0, optimizer)
     known = {id(p) for p in (*model.gaussians.params.values(), *named.values())}
     for group in optimizer.param_groups:
         for p in (p for p in group["params"] if id(p) not in known and not bool(torch.isfinite(p).all())):
             bad = ~torch.isfinite(p)
             name = "exposure" if p is model.exposure.values else "the poses"
-            messages.append(f"mended {_counted(int(bad.sum()), 'number')} of {name}")
+            messages.append(f"repaired {_counted(int(bad.sum()), 'number')} of {name}")
             _mend(p, bad, 0.0, optimizer)
     count = sum(_clear_moments(optimizer, p) for group in optimizer.param_groups for p in group["params"])
     if count:
@@ -252,14 +252,14 @@ def _repair_gaussians(
         params = model.gaussians.params
     flat = params["quats"].abs().amax(1) <= QUAT_MIN
     if bool(flat.any()):
-        messages.append(f"mended {_counted(int(flat.sum()), 'Gaussian')} (quats without length)")
+        messages.append(f"repaired {_counted(int(flat.sum()), 'Gaussian')} (quats without length)")
         identity = params["quats"].new_tensor([1.0, 0.0, 0.0, 0.0])
         _mend(params["quats"], flat[:, None].expand(-1, 4), identity.expand(len(flat), 4), optimizer)
     host_params: Mapping[str, Owned] = {} if model.field is None else model.field.owned
     for name, owned in host_params.items():
         rows = _bad_rows(params[name])
         if bool(rows.any()):
-            messages.append(f"mended {_counted(int(rows.sum()), 'Gaussian')} ({name} not finite)")
+            messages.append(f"repaired {_counted(int(rows.sum()), 'Gaussian')} ({name} not finite)")
             _mend(params[name], ~torch.isfinite(params[name]), owned.value, optimizer)
     return messages
 

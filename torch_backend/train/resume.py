@@ -66,7 +66,7 @@ def restore_run(trainer: Trainer, path: Path) -> None:
 def _restore(trainer: Trainer, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
     if meta["train_frames"] != [trainer.scene.frames[i] for i in trainer.train_ids]:
         raise JobError(
-            "The run's checkpoint was trained on other frames.", "Train with --restart, or another run name.",
+            "The run's checkpoint was trained on other frames.", "Train with --restart, or choose another run name.",
             ExitCode.TRAIN,
         )  # fmt: skip
     trainer.model = restore_model(tensors, meta, trainer.config, trainer.device)

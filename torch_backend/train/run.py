@@ -104,8 +104,8 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     if folder != run and params.resume:
         report.warning(
-            "The run's settings, cameras or motion mattes changed: it is trained anew.",
-            "The run that is there stays until the new one is done.",
+            "The run's settings, cameras or motion mattes changed: training starts again from the beginning.",
+            "The existing run is kept until the new one is done.",
         )
     depth = None
     if sequence is not None:
@@ -157,7 +157,10 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         report.progress("training", done, begun.steps, f"resumed at step {trainer.iteration}")
     else:
         if begun is not None:
-            report.warning(f"{begun.steps} steps were begun, {params.extend} are asked for: they begin anew.")
+            report.warning(
+                f"{begun.steps} steps were started, but {params.extend} are requested: the extension starts again "
+                "from the beginning."
+            )
         restore_run(trainer, checkpoint)
         trainer.extend(params.extend, before["heldout_psnr_db"])
     summary = prepared.trained(shot, params.run, folder, extension, trainer.iteration)
@@ -178,7 +181,7 @@ def _extendable(shot: Shot, run: str, folder: Path) -> tuple[dict[str, Any], dic
         raise JobError(f"The run {run!r} is not finished: it cannot be extended yet.", hint, ExitCode.TRAIN)
     if facts["solve"] != solve_key(shot):
         message = f"The run {run!r} was trained on other cameras than the shot has now: it cannot be extended."
-        raise JobError(message, "Remove the run or name another one, then train.", ExitCode.TRAIN)
+        raise JobError(message, "Remove the run or choose another name, then train.", ExitCode.TRAIN)
     if has_changed_pictures(shot, facts):
         message = f"The run {run!r} was trained on other pictures than the shot has now: it cannot be extended."
         raise JobError(message, "Train it again.", ExitCode.TRAIN)
@@ -212,8 +215,7 @@ def _prepared(
     )
     if depth is not None and trainer.targets is None:
         report.warning(
-            "This run heeds no motion mattes: its depth maps are used where the training begins and in frozen frames, "
-            "and pull nothing in between."
+            "This run uses no motion mattes: its depth maps only affect the start of the training and frozen frames."
         )
     return _Prepared(trainer, test, images[len(train) :])
 

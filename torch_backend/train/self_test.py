@@ -196,7 +196,7 @@ def run_in_child(key: str) -> SelfTest:
     except (ValueError, KeyError, TypeError):
         if ran.returncode == ExitCode.ENVIRONMENT:
             return SelfTest(key=key, problem="it could not be tested", lasting=False)
-        last = (ran.stderr.strip().splitlines() or ["without a word"])[-1]
+        last = (ran.stderr.strip().splitlines() or ["no output"])[-1]
         problem = f"the process that tested it ended with code {ran.returncode} ({last})"
         return SelfTest(key=key, problem=problem, lasting=_crashed(ran.returncode))
 

@@ -116,12 +116,12 @@ class Soundness:
             if len(self.unusable) == len(run.train_ids):
                 raise unstable(run.iteration)
             names = ", ".join(str(run.scene.frames[run.train_ids[frame]]) for frame in bad)
-            done = f"left frame {names} out from now on (its image is not finite)"
+            done = f"excluded frame {names} from the training (its image is not finite)"
         elif gradients and not done:
             done = drop_offenders(model, run.optimizer, run.densifier)
         self.mended += bool(done) or gradients
         if done:
-            run.report.warning(f"{skipped or f'Step {run.iteration}.'} Repaired: {done}. Training goes on.")
+            run.report.warning(f"{skipped or f'Step {run.iteration}.'} Repaired: {done}. Training continues.")
         elif skipped:
             run.report.warning(skipped)
         elif not gradients:

@@ -134,22 +134,22 @@ def _sentences(
     if dim:
         on = "held-out frames" if figures.held_out else "training frames"
         sentences.append(
-            f"It does not show the clip: {figures.median_db:.1f} dB on half of its {on}, "
-            f"{figures.tenth_db:.1f} dB on the worst tenth."
+            f"It does not match the clip: {figures.median_db:.1f} dB on half of its {on}, {figures.tenth_db:.1f} dB "
+            "on the worst tenth."
         )
     elif not places:
         sentences.append(EXPLAINED)
-    sentences += [f"It does not hold in {span_text(place)}." for place in places]
+    sentences += [f"It does not match the clip in {span_text(place)}." for place in places]
     if figures.learnt_no_motion(limits):
         share = 100.0 * (figures.matte_moving or 0.0)
-        sentences.append(f"Nothing moves in it, but the motion mattes call {share:.0f} % of the frames moving.")
+        sentences.append(f"Nothing moves in it, but the motion mattes mark {share:.0f} % of the frames as moving.")
     elif figures.sway < limits.still:
         sentences.append("Nothing moves in it.")
     elif walks:
         farthest, place = round(figures.farthest * width), span_text(walks[0])
         sentences.append(f"Something does not hold still: it travels up to {farthest} of {width} pixels in {place}.")
     else:
-        sentences.append(f"What moves sways by up to {max(1, round(figures.sway * width))} of {width} pixels.")
+        sentences.append(f"Moving parts sway by up to {max(1, round(figures.sway * width))} of {width} pixels.")
     return sentences
 
 
@@ -161,25 +161,25 @@ def _advice(
     if figures.learnt_no_motion(limits) and not places and not dim:
         return ["Train with more steps; where the mattes are wrong, paint over them."]
     if figures.sway < limits.still and not places and not dim:
-        return ["Any frame will do as t*."]
+        return ["Any frame works as t*."]
     if dim or (places and span is None):
         still = figures.still_unexplained
         return [_LOOK if still is None else _SOLVE if still > limits.still_lost else _HOLD]
     if span is not None and places:
-        return [f"Choose t* in frames {span[0]} to {span[1]}, or train on that range alone."]
+        return [f"Choose t* in frames {span[0]} to {span[1]}, or train only on that range."]
     if span is not None and walks:
-        return [f"If it shows in the freeze, train on frames {span[0]} to {span[1]} alone: there all hold still."]
+        return [f"If it shows in the freeze, train only on frames {span[0]} to {span[1]}, where everyone holds still."]
     if walks:
-        return ["Paint who walks in the motion matte, or take a range in which all hold still."]
+        return ["Paint walking people in the motion matte, or choose a range in which everyone holds still."]
     return []
 
 
-EXPLAINED = "It shows all of the clip."
-_HOLD = "Somebody walks through: take a range in which all hold still."
-_SOLVE = "Even what stands still is not there: solve the camera again, or take a range that it follows well."
+EXPLAINED = "It matches the whole clip."
+_HOLD = "Somebody walks through: choose a range in which everyone holds still."
+_SOLVE = "Even static parts are missing: solve the camera again, or choose a range with a good solve."
 _LOOK = (
-    "Look at its previews. Somebody walks through, or the camera is wrong: take a range in which all hold still, "
-    "or solve again."
+    "Check its previews. If somebody walks through, choose a range in which everyone holds still; if the camera is "
+    "wrong, solve again."
 )
 
 

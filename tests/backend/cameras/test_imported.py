@@ -190,7 +190,7 @@ def test_unusable_transforms_are_a_sentence(tmp_path, change, words):
 
 @pytest.mark.parametrize("make", [lambda p: p / "gone", lambda p: p])
 def test_nothing_there_is_a_sentence(tmp_path, make):
-    with pytest.raises(JobError, match="does not exist|holds no cameras"):
+    with pytest.raises(JobError, match="does not exist|contains no cameras"):
         imported.read(make(tmp_path))
 
 
@@ -257,7 +257,7 @@ def test_too_few_or_another_shape_are_refused():
         imported.match(fake_solve(20), Counted(list(range(101, 121))), (640, 480), solved=None) and imported.match(
             fake_solve(5), Counted(list(range(101, 121))), (640, 480)
         )
-    with pytest.raises(JobError, match="640 x 480 pixels, the shot's frames have another shape, 640 x 360"):
+    with pytest.raises(JobError, match="640 x 480 pixels, but the shot's frames have another aspect ratio, 640 x 360"):
         imported.match(fake_solve(20), Counted(list(range(101, 121))), (640, 360))
 
 
@@ -316,5 +316,5 @@ def test_what_blender_says_of_a_camera_of_its_scene_is_believed(tmp_path):
 @pytest.mark.parametrize("ending", ["abc", "FBX", "usdc"])
 def test_files_that_blender_reads_are_said_to_be_blenders(tmp_path, ending):
     (tmp_path / f"set.{ending}").write_bytes(b"x")
-    with pytest.raises(JobError, match=f"set.{ending} is read by Blender alone"):
+    with pytest.raises(JobError, match=f"Only Blender can read set.{ending}"):
         imported.read(tmp_path / f"set.{ending}")

@@ -60,7 +60,7 @@ def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
     record = read_json(shot.solve / "solve.json")
     assert (record["camera_model"], record["focal_px"], record["cameras_from"]) == ("OPENCV", 300.0, "transforms.json")
     assert record["world"] == "scene" and read_json(solved.shot.solve / "solve.json")["world"] == ""
-    assert result["quality"].startswith("Fair: cameras given for 18 of 21 frames, ")
+    assert result["quality"].startswith("Fair: cameras imported for 18 of 21 frames, ")
     assert result["reprojection_error_px"] < 0.8
     assert (shot.solve / "colmap" / "images.bin").is_file()
     before = (shot.solve / "solve.json").stat().st_mtime_ns
@@ -82,7 +82,7 @@ def test_a_colmap_folder_brings_its_own_points(solved, tools, tmp_path):
     np.testing.assert_allclose(other["xyz"], one["xyz"])
     # COLMAP may count an image twice if the image observes a point twice.
     assert (other["track"] <= one["track"]).all() and (other["track"] == one["track"]).mean() > 0.9
-    assert result["registered"] == 11 and result["quality"].startswith("Good: cameras given for 11 of 11 frames")
+    assert result["registered"] == 11 and result["quality"].startswith("Good: cameras imported for 11 of 11 frames")
     difference = read_png(shot.frames / "000105.png").astype(int) - read_png(solved.shot.frames / "000105.png")
     assert np.abs(difference).max() <= 1
 
@@ -172,7 +172,7 @@ def test_colmap_itself_reads_what_is_exported(solved, tmp_path):
 
 def test_an_export_never_hides_behind_another_model(solved, tmp_path):
     export_cameras(solved.shot, "colmap", tmp_path)
-    with pytest.raises(JobError, match=r"holds another COLMAP model already \(cameras\.bin\)"):
+    with pytest.raises(JobError, match=r"already contains another COLMAP model \(cameras\.bin\)"):
         export_cameras(solved.shot, "colmap", tmp_path, text=True)
     export_cameras(solved.shot, "colmap", tmp_path)
     with pytest.raises(JobError, match="has no cameras yet"):
@@ -194,7 +194,7 @@ def test_how_much_agrees_decides():
     refuse_misfit(answer, 500)
     assert doubts(answer) == [] and doubts({"triangulation_angle_deg": 5.0}) == []
     assert "Only 40 %" in doubts({**answer, "agreement": 0.4})[0][0]
-    with pytest.raises(JobError, match="only 500 points of the scene, and 20 % of what was matched agree"):
+    with pytest.raises(JobError, match="only 500 points of the scene, and 20 % of the matches agree"):
         refuse_misfit({**answer, "agreement": 0.2}, 500)
     with pytest.raises(JobError, match="only 99 points"):
         refuse_misfit(answer, 99)

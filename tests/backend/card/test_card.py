@@ -60,7 +60,7 @@ def test_where_memory_ends_the_field_works_in_pieces_first(walk):
 def test_where_memory_ends_without_a_field_the_least_go(walk):
     told = walk("memory_ends static")
     assert told["iteration"] == 14 and told["finite"] and told["saved"]
-    assert told["after"] < told["before"] and "that cover least were dropped" in told["warnings"][0]
+    assert told["after"] < told["before"] and "that cover least were removed" in told["warnings"][0]
     assert told["budget"] == 330, "what was asked for is the run's key"
 
 

@@ -50,7 +50,7 @@ def test_a_shot_of_another_clip_is_refused_in_words(tmp_path):
     (tmp_path / "a.mp4").touch()
     check_same_clip(tmp_path / "shot.splannequin", tmp_path / "a.mp4")
     check_same_clip(tmp_path / "none.splannequin", tmp_path / "a.mp4")
-    with pytest.raises(JobError, match="is the shot of another clip: .*a.mp4"):
+    with pytest.raises(JobError, match="is the shot folder of another clip: .*a.mp4"):
         check_same_clip(tmp_path / "shot.splannequin", tmp_path / "b.mp4")
 
 

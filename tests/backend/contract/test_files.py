@@ -88,7 +88,7 @@ def test_a_file_that_is_whole_is_opened(tmp_path: Path):
     path = tmp_path / "a"
     path.write_bytes(b"12345")
     assert regular_file(path, 5) == str(path)
-    with pytest.raises(UnreadableFile, match="more than a file of its kind"):
+    with pytest.raises(UnreadableFile, match="too large for this kind of file"):
         regular_file(path, 4)
     link = tmp_path / "link"
     link.symlink_to(path)
@@ -130,5 +130,5 @@ def test_arrays_that_unpack_to_more_than_the_memory(tmp_path: Path, monkeypatch:
     with open_arrays(path) as source, np.load(source, allow_pickle=False) as arrays:
         assert arrays["xyz"].nbytes == 64 << 20
     monkeypatch.setattr("torch_backend.contract.files.LONGEST_ARRAYS", 1 << 20)
-    with pytest.raises(UnreadableFile, match="holds more than"):
+    with pytest.raises(UnreadableFile, match="too large for this kind"):
         open_arrays(path).__enter__()

@@ -186,7 +186,7 @@ def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, in
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("take", "s.splannequin"), "`take SHOT` is called `freeze SHOT` now"),
+        (("take", "s.splannequin"), "`take SHOT` is now called `freeze SHOT`"),
         (("train", "s.splannequin", "--host", "mlp", "--method", "static"), "--host is passed over"),
         (("train", "s.splannequin", "--detector", "weight"), "only with --supervision paper"),
         (("train", "s.splannequin", "--extend", "9", "--preset", "final", "--run", "a"), "--preset: passed over"),
@@ -222,7 +222,7 @@ def test_json_may_stand_before_the_verb_and_after_it(tmp_path, capsys):
 def test_limits_are_said_as_they_are():
     with pytest.raises(ValueError, match=r"is 5.0: it should be 0.25 to 4"):
         contract.check_params(contract.ImportParams(source="clip.mp4", pixel_aspect=5.0))
-    with pytest.raises(ValueError, match="'--5': it should be the number of a frame"):
+    with pytest.raises(ValueError, match=r"t\* is set for frame '--5', which is not a frame number"):
         contract.check_params(contract.FreezeParams(t_star_per_frame={"--5": 3.0}))
 
 

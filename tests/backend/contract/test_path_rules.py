@@ -42,5 +42,5 @@ def test_rules_are_read_from_the_file_that_the_engine_names(tmp_path, monkeypatc
     file.write_text("{}")
     assert mapped("/a/b") == "/a/b", "what an engine without rules writes"
     file.write_text('{"path_mapping_rules": ["/a"]}')
-    with pytest.raises(ValueError, match="holds no path mapping rules"):
+    with pytest.raises(ValueError, match="contains no path mapping rules"):
         mapped("/a/b")

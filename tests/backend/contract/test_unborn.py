@@ -35,7 +35,7 @@ def test_a_folder_that_is_not_there_is_nothing_to_take(tmp_path):
 def test_a_folder_of_somebody_elses_is_not_filled(tmp_path):
     (tmp_path / "scene.blend").write_bytes(b"BLENDER")
     (tmp_path / "textures").mkdir()
-    with pytest.raises(JobError, match=r"holds other files \(scene\.blend and 1 more\)"):
+    with pytest.raises(JobError, match=r"contains other files \(scene\.blend and 1 more\)"):
         Shot.create(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.blend", "textures"]
 

@@ -77,7 +77,7 @@ def test_what_a_job_costs(shot, requests):
     assert told.on_hosts[1] / 2 <= told.on_hosts[2] < told.on_hosts[1] * 0.7
     assert told.disk_gb == pytest.approx(3 * (2 * 20 * 1920 * 1080 * 50 + 100e6) / 1e9, rel=0.01)
     said = "\n".join(sentences(told, "of nobody"))
-    assert "3 shots, 42 tasks. By rates of nobody" in said and "freeze       24 tasks" in said
+    assert "3 shots, 42 tasks. Estimated from rates of nobody" in said and "freeze       24 tasks" in said
     assert "engine       15 sessions" in said
     assert estimate(steps, ONE, False, False).card_hours == 0.0
 
@@ -134,6 +134,6 @@ def test_rates_of_a_file_stand_in_the_place_of_ours(tmp_path):
     assert read["train"] == Rate(1.0, 2.0, 3.0, 4) and read["freeze"] == rates.MEASURED["freeze"]
     for wrong in ({"version": 2}, {"version": 1, "rates": {"nap": dataclasses.asdict(Rate(1, 1, 1, 1))}}, {}):
         write_json(file, wrong)
-        with pytest.raises(JobError, match="holds no rates"):
+        with pytest.raises(JobError, match="is not a file of rates"):
             read_rates(file)
     assert all(math.isfinite(rate.seconds(1.0)) for rate in rates.MEASURED.values())

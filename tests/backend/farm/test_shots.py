@@ -161,7 +161,7 @@ def test_instants_that_cannot_be_are_said_before_any_work(shot, requests, instan
 
 def test_a_folder_without_an_import_is_refused(tmp_path, requests):
     write_json(tmp_path / "a.splannequin" / "shot.json", {"version": 1, "name": "a"})
-    with pytest.raises(JobError, match="holds no imported clip"):
+    with pytest.raises(JobError, match="contains no imported clip"):
         gather([str(tmp_path / "a.splannequin")], requests(), [], {}, "")
 
 
@@ -175,7 +175,7 @@ def test_a_list_of_instants(tmp_path):
     with pytest.raises(JobError, match=r"Line 1 .* is not the name of a shot and its instants"):
         read_instants(str(file))
     assert parse_instants(" 34,60 7") == [34, 60, 7] and parse_instants("") == []
-    with pytest.raises(JobError, match="'x' are no instants"):
+    with pytest.raises(JobError, match="'x' is not a list of instants"):
         parse_instants("x")
 
 

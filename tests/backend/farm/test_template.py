@@ -123,7 +123,7 @@ def test_what_a_task_is_asked_for_comes_out_of_its_file_again(job, tmp_path):
     assert request["freeze"]["width"] == 320 and request["freeze"]["t_star_per_frame"] == {"3": 4.0}
     assert (request["takes"], request["first"], request["last"]) == ({"": "freeze"}, 1, 23)
     write_json(tmp_path / "out.json", {**request, "version": 2})
-    with pytest.raises(JobError, match="is no request"):
+    with pytest.raises(JobError, match="is not a request"):
         read_request(tmp_path / "out.json")
 
 
@@ -228,7 +228,7 @@ def test_a_path_that_the_engine_refuses_is_one_sentence_at_export(imported, tmp_
     [
         (("--frames", "0"), "--frames is 0"),
         (("--t-star", "99"), "t* is frame 99: hall has frames 1 to 20"),
-        (("--rates", "no.json"), "no.json holds no rates"),
+        (("--rates", "no.json"), "no.json is not a file of rates"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(shots, tmp_path, words, said, capsys):

@@ -46,7 +46,7 @@ def test_without_a_shoulder_nothing_is_touched():
     assert display_of({}) == PLAIN and display_of({"display": ROLLED.name}) == ROLLED
     with pytest.raises(JobError, match=r"does not know: 'filmic'\."):
         display_of({"display": "filmic"})
-    with pytest.raises(ValueError, match="does not hold light"):
+    with pytest.raises(ValueError, match="cannot show scene-linear light"):
         PLAIN.codes_of(np.zeros((2, 2, 3), np.float16), 2, 2)
 
 

@@ -155,8 +155,8 @@ def test_repeated_and_blank_frames_are_kept_but_not_solved(shot, tmp_path, pan, 
     assert (record[6]["flags"], record[11]["flags"]) == (["duplicate"], ["blank"])
     assert [n for n, f in record.items() if not f["solve"]] == [6, 11]
     assert report.warnings == [
-        "Neither solved nor trained on, for being repeats: frame 6.",
-        "Neither solved nor trained on, for being blank: frame 11.",
+        "Not used for the solve and the training because they are repeats: frame 6.",
+        "Not used for the solve and the training because they are blank: frame 11.",
     ]
 
 
@@ -201,7 +201,7 @@ def test_a_still_is_refused(shot, tmp_path, pan, write_video, recorder):
 
 def test_a_range_outside_of_the_clip_is_refused(shot, clip, recorder):
     error = refused(shot, recorder, clip, FootageConfig(first=30, last=60))
-    assert error.message == "Frames 30 to 60 lie outside of the clip, which has 1 to 20."
+    assert error.message == "Frames 30 to 60 lie outside the clip, which has 1 to 20."
 
 
 def test_a_range_of_too_few_frames_is_refused(shot, clip, recorder):
@@ -272,7 +272,7 @@ def test_a_rate_or_a_layer_for_a_video_is_told_to_be_passed_over(shot, clip, rec
     report = recorder()
     assert import_footage(shot, clip, FootageConfig(fps=50.0, layer="rgba"), report)["fps"] == 10.0
     assert report.warnings == [
-        "The rate 50.0 is passed over: a video has its own, 10 frames per second.",
+        "The rate 50.0 is ignored: a video has its own, 10 frames per second.",
         "The layer 'rgba' is passed over: a video has its own, a single one.",
     ]
 
@@ -319,7 +319,7 @@ def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, 
         "Frames 1 to 12 are read from shot.####.png.",
         "Assumed, for the footage does not say: rate.",
     ]
-    assert "The matrix 'bt709' is passed over: pictures hold RGB as it is." in report.warnings
+    assert "The matrix 'bt709' is ignored: pictures already store RGB." in report.warnings
 
 
 def test_a_full_disk_is_told_before_the_work(shot, clip, recorder, monkeypatch):

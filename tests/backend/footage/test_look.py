@@ -75,11 +75,11 @@ def test_another_content_of_the_look_is_another_import(tmp_path, pan, write_vide
     ("name", "content", "words"),
     [
         ("gone.cube", None, "cannot be read"),
-        ("look.txt", "LUT_1D_SIZE 2\n0 0 0\n1 1 1\n", "is no .cube file"),
-        ("words.cube", "not a look\n", "is damaged, or no .cube table"),
-        ("short.cube", "LUT_3D_SIZE 4\n0 0 0\n1 1 1\n", "is damaged, or no .cube table"),
-        ("huge.cube", "LUT_3D_SIZE 9000\n0 0 0\n", "is damaged, or no .cube table"),
-        ("empty.cube", "", "is damaged, or no .cube table"),
+        ("look.txt", "LUT_1D_SIZE 2\n0 0 0\n1 1 1\n", "is not a .cube file"),
+        ("words.cube", "not a look\n", "is damaged, or not a .cube table"),
+        ("short.cube", "LUT_3D_SIZE 4\n0 0 0\n1 1 1\n", "is damaged, or not a .cube table"),
+        ("huge.cube", "LUT_3D_SIZE 9000\n0 0 0\n", "is damaged, or not a .cube table"),
+        ("empty.cube", "", "is damaged, or not a .cube table"),
     ],
 )
 def test_what_is_no_look_is_refused_in_one_sentence(tmp_path, pan, write_video, name, content, words):
@@ -93,5 +93,5 @@ def test_what_is_no_look_is_refused_in_one_sentence(tmp_path, pan, write_video, 
 
 
 def test_a_look_and_a_colour_space_are_one_too_many():
-    with pytest.raises(JobError, match="are both given"):
+    with pytest.raises(JobError, match="^Both a colour space"):
         overrides_of(FootageConfig(lut="a.cube", colour_space="ACEScg"))

@@ -74,7 +74,7 @@ def test_as_many_pictures_as_frames_are_taken_in_order_and_that_is_said(shot, re
     report = recorder()
     mask = read_masks(shot, {"people": write_masks(tmp_path / "m", range(10))}, report)["people"]
     assert (mask.of(110) == np.roll(COVERED, 9, axis=1)).all()
-    assert "is numbered 0 to 9, the frames 101 to 110: picture 0 is taken for frame 101" in report.warnings[0]
+    assert "is numbered 0 to 9, the frames 101 to 110: picture 0 is used for frame 101" in report.warnings[0]
 
 
 def test_a_larger_mask_is_brought_to_the_frames_size(shot, recorder, tmp_path):
@@ -138,7 +138,7 @@ def test_the_alpha_of_a_video_masks_as_that_of_pictures_does(tmp_path, pan, reco
     write_alpha_video(clip, codec, pan(12))
     shot, report = Shot.create(tmp_path / "a.splannequin"), recorder()
     import_footage(shot, str(clip), FootageConfig(first=2, last=11), report)
-    assert "The clip has alpha: its colour is taken, its alpha is not." in report.warnings
+    assert "The clip has alpha: its colour is used, its alpha is ignored." in report.warnings
     ignored = masks_of(shot, recorder, ignore="alpha")["ignore"]
     assert list(ignored.packed) == list(range(2, 12))
     for frame in (2, 7, 11):
@@ -159,7 +159,7 @@ def test_a_video_without_alpha_is_told_to_have_none(tmp_path, pan, recorder, wri
     write_video(tmp_path / "a.mp4", pan(10))
     shot = Shot.create(tmp_path / "a.splannequin")
     import_footage(shot, str(tmp_path / "a.mp4"), FootageConfig(), recorder())
-    with pytest.raises(JobError, match=r"a\.mp4 has no alpha to mask by\."):
+    with pytest.raises(JobError, match=r"a\.mp4 has no alpha channel to use as a mask\."):
         masks_of(shot, recorder, ignore="alpha")
 
 
@@ -177,14 +177,14 @@ def test_a_mask_is_known_by_what_it_covers_and_not_by_its_file(shot, recorder, t
         (lambda d: write_masks(d / "m", range(101, 108)), "has no picture for frames 108-110, of 10 frames."),
         (
             lambda d: write_masks(d / "m", FRAMES, np.ones((48, 96), bool)),
-            "is 96x48, the footage 64x48: they have not the same shape.",
+            "is 96x48, the footage 64x48: their aspect ratios differ.",
         ),
         (lambda d: write_masks(d / "m", FRAMES, np.zeros((48, 64), bool)), "covers nothing in any frame."),
         (
             lambda d: write_masks(d / "m", FRAMES, np.ones((48, 64), bool)),
-            "covers 100 % of the picture: nothing is left to solve the camera by.",
+            "covers 100 % of the picture: too little is left to solve the camera.",
         ),
-        (lambda _: "alpha", "f.101.png has no alpha to mask by."),
+        (lambda _: "alpha", "f.101.png has no alpha channel to use as a mask."),
     ],
 )
 def test_what_does_not_fit_is_refused_in_words(shot, recorder, tmp_path, write, message):

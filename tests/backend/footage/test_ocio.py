@@ -156,7 +156,7 @@ def test_names_that_cannot_be_are_refused_in_a_sentence(tmp_path, monkeypatch):
     with pytest.raises(JobError, match=f"configuration {BUILT_IN} has no colour space 'ACEScgg'") as refused:
         Colours("ACEScgg").space()
     assert "among them: ACEScg" in refused.value.hint and refused.value.exit_code == ExitCode.FOOTAGE
-    with pytest.raises(JobError, match="'Raw' is no colour but data"):
+    with pytest.raises(JobError, match="'Raw' is a colour space for data"):
         Colours("Raw").space()
     monkeypatch.setenv("OCIO", str(tmp_path / "none.ocio"))
     with pytest.raises(JobError, match="cannot be read"):

@@ -79,7 +79,7 @@ def test_a_matrix_that_is_none_of_the_eight_is_told_and_shows_the_picture_as_it_
         64,
         48,
     )
-    assert any("as they are stored" in message for message, _ in source.warnings) and source.info.mismatch
+    assert any("read as stored" in message for message, _ in source.warnings) and source.info.mismatch
 
 
 def test_a_matrix_that_only_enlarges_changes_nothing(tmp_path, pan, write_video):

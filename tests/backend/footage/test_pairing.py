@@ -44,7 +44,7 @@ def test_how_pictures_are_counted(pictures, frames, clip, shift, step, needs_all
     paired = pair(list(pictures), Counted(list(frames), clip, shift), needs_all)
     assert list(paired.numbers) == list(frames) and step_of(paired) == step
     said = pairing_words("The mask", list(pictures), paired)
-    assert step == 0 or f"picture {frames[0] - step} is taken for frame {frames[0]}," in said[0]
+    assert step == 0 or f"picture {frames[0] - step} is used for frame {frames[0]}," in said[0]
 
 
 def test_a_second_way_that_fits_as_well_is_told():

@@ -259,7 +259,7 @@ def test_moved_and_copied_footage_is_found_other_footage_is_refused(tmp_path, pa
     os.utime(old / "clips" / "a.mp4", (1, 1))  # a copy has another modification time
     assert (Plates(shot).width, Plates(shot).note) == (128, "")
     write_video(old / "clips" / "a.mp4", pan(10, height=96, width=128, seed=5))
-    assert "is not what was imported" in Plates(shot).note
+    assert "has changed since the import" in Plates(shot).note
 
 
 def test_an_import_whose_chroma_was_scaled_up_otherwise_is_known_again(tmp_path, write_video, shot_of):
@@ -284,7 +284,7 @@ def test_an_import_whose_chroma_was_scaled_up_otherwise_is_known_again(tmp_path,
     files = sorted(shot.raw.iterdir())
     for file, picture in zip(files, [read_png(f) for f in (*files[1:], files[0])], strict=True):
         write_png(file, picture)
-    assert "is not what was imported any more" in Plates(shot).note, "the next frame is another one"
+    assert "has changed since the import" in Plates(shot).note, "the next frame is another one"
 
 
 def test_a_file_that_breaks_meanwhile_is_named(tmp_path, shot_of):
@@ -293,7 +293,7 @@ def test_a_file_that_breaks_meanwhile_is_named(tmp_path, shot_of):
     pictures = [np.rint(255 * smooth[:, 2 * n : 2 * n + 64]).astype(np.uint8) for n in range(9)]
     plates = Plates(shot_of(write_sequence(tmp_path / "f", pictures), working_height=24))
     (tmp_path / "f" / "a.1005.png").write_bytes(b"no picture")
-    with pytest.raises(JobError, match="Frame 1005 of the footage cannot be read"):
+    with pytest.raises(JobError, match="Frame 1005 of the footage can no longer be read"):
         plates.display(1005)
 
 

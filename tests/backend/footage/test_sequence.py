@@ -310,7 +310,7 @@ def test_gaps_and_unreadable_files_are_named(exrs):
 
 def test_pictures_of_two_sizes_are_refused(exrs):
     write(exrs / "shot.1006.exr", np.zeros((20, 30, 3), np.float16))
-    with pytest.raises(JobError, match=r"shot\.1006\.exr is 30x20, the sequence began with 64x48\."):
+    with pytest.raises(JobError, match=r"shot\.1006\.exr is 30x20, but the sequence starts with 64x48\."):
         list(open_source(str(exrs)).frames(None, None))
 
 
@@ -402,7 +402,7 @@ def test_transparent_pictures_keep_their_colour_and_say_that_alpha_is_not_taken(
     assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
     glow = next(iter(source.frames(None, None))).pixels[5, 0]
     assert glow == pytest.approx([0.2, 0.1, 0.0], abs=1e-4)
-    assert said(source)[0] == "The pictures are transparent in places: their colour is taken, their alpha is not."
+    assert said(source)[0] == "The pictures are transparent in places: their colour is used, their alpha is ignored."
 
 
 @pytest.mark.parametrize(("suffix", "associated"), [("png", False), ("tif", False), ("tif", True)])

@@ -109,9 +109,7 @@ def test_interlaced_clips_become_whole_pictures_and_say_so(interlaced, top_first
     inner = np.s_[:, 4:-4]
     assert np.abs(pictures - firsts)[inner].mean() < 1.0
     assert np.abs(pictures - firsts)[inner].max() < 8.0, "a comb of the other field is 60 off"
-    assert [w[0] for w in source.warnings] == [
-        "The clip is interlaced: each frame becomes a whole picture of its first field."
-    ]
+    assert [w[0] for w in source.warnings] == ["The clip is interlaced: each frame is built from its first field."]
     assert source.info.reading["interlaced"] and "deinterlaced" in source.info.key
     assert source.info.mismatch.startswith("it is interlaced")
 
@@ -132,7 +130,7 @@ def test_a_clip_that_is_interlaced_without_saying_so_becomes_whole_pictures(tmp_
     write_video(tmp_path / "a.mp4", woven(frames, top_first))
     source, got = decoded(tmp_path / "a.mp4")
     assert [w[0] for w in source.warnings] == [
-        "The clip is interlaced, though it does not say so: each frame becomes a whole picture of its first field."
+        "The clip is interlaced, though it does not say so: each frame is built from its first field."
     ]
     assert source.info.reading["interlaced"] and source.info.mismatch.startswith("it is interlaced")
     off = [np.abs(one.pixels.astype(int) - first)[4:-4].mean() for one, first in zip(got, frames[::2], strict=True)]
@@ -218,14 +216,16 @@ def test_a_file_that_breaks_off_says_how_much_of_it_there_is(broken_off, suffix)
     source, got = decoded(broken_off(suffix, 0.75))
     assert 12 <= len(got) < 24
     assert [f.number for f in got] == list(range(1, len(got) + 1))
-    assert [w[0] for w in source.warnings] == [f"broken.{suffix} breaks off after frame {len(got)}: it announces 24."]
+    assert [w[0] for w in source.warnings] == [
+        f"broken.{suffix} ends after frame {len(got)}, but its header announces 24."
+    ]
     asked, got = decoded(broken_off(suffix, 0.75), 2, 10)  # the range ends before the break: no warning
     assert ([f.number for f in got], asked.warnings) == (list(range(2, 11)), [])
 
 
 @pytest.mark.parametrize(("suffix", "share"), [("mp4", 0.6), ("mov", 0.45), ("mkv", 0.45)])
 def test_less_than_half_of_a_file_is_refused(broken_off, suffix, share):
-    with pytest.raises(JobError, match=r"breaks off after frame \d+: it announces 24\.") as error:
+    with pytest.raises(JobError, match=r"ends after frame \d+, but its header announces 24\.") as error:
         decoded(broken_off(suffix, share))
     assert error.value.exit_code == ExitCode.FOOTAGE
 
@@ -295,7 +295,7 @@ def test_pixels_that_no_lens_makes_are_taken_as_square(tmp_path, pan, write_vide
     write_video(tmp_path / "a.mp4", pan(8), aspect=Fraction(5, 1))
     source, got = decoded(tmp_path / "a.mp4")
     assert got[0].pixels.shape == (48, 64, 3)
-    assert source.warnings[0][0] == "The footage claims pixels 5 times as wide as high: taken as square."
+    assert source.warnings[0][0] == "The footage claims pixels 5 times as wide as high: read as square."
 
 
 def test_sound_alone_is_no_video(tmp_path):
@@ -349,7 +349,7 @@ def test_which_of_two_streams_is_read_is_said_and_the_other_can_be_named(two_str
     assert source.warnings == [
         (
             "The clip has 2 video streams: number 1 is taken, 64x48.",
-            "Name another by its number (--layer): 1 (64x48), 2 (64x48).",
+            "Choose another by its number (--layer): 1 (64x48), 2 (64x48).",
         )
     ]
     assert close(got[0].pixels, firsts[0], 2) and not source.info.mismatch

@@ -139,7 +139,7 @@ def test_hdr_highlights_are_kept(write_patches):
 def test_a_transfer_function_that_is_not_known_is_told(write_patches):
     source, _ = write_patches(9, 1, 1)
     assert source.warnings[0][0] == (
-        "The clip's transfer function (number 9 of ITU-T H.273) is not known here: taken as video."
+        "The clip's transfer function (number 9 of ITU-T H.273) is unknown: read as video."
     )
     assert not source.info.reading["colour_told"]
 
@@ -148,9 +148,9 @@ def test_a_transfer_function_that_is_not_known_is_told(write_patches):
     "size, tags, told, unlike",
     [
         ((48, 64), {}, {}, ""),
-        ((16, 1280), {}, {}, "it does not say by which matrix its colours are stored"),
+        ((16, 1280), {}, {}, "it does not state its colour matrix"),
         ((16, 1280), {"colorspace": 1}, {}, ""),
-        ((48, 64), {}, {"matrix": "bt709"}, "its matrix or range was set by hand"),
+        ((48, 64), {}, {"matrix": "bt709"}, "its matrix or levels were set by hand"),
         ((48, 64), {"rotation": 90}, {}, ""),  # Blender applies the rotation itself
         ((48, 64), {"aspect": Fraction(2)}, {}, "its pixels are not square"),
     ],

@@ -66,13 +66,13 @@ def answer(focal=600.0, **lens):
         (answer(80.0), "151.9 degrees wide (80 px)"),
         (answer(300.0, view_deg=152.0), "152.0 degrees wide (300 px)"),
         (answer(impossible="folded"), "it folds the picture over before its corners (4.08)"),
-        (answer(impossible="strong"), "it bends the picture out of all measure (4.08)"),
+        (answer(impossible="strong"), "its distortion is far too strong (4.08)"),
     ],
 )
 def test_a_lens_that_no_camera_has_is_refused_in_one_sentence(told, words):
     with pytest.raises(JobError) as error:
         refuse_lens(told)
-    assert error.value.message == f"The solve found a lens that no camera has: {words}."
+    assert error.value.message == f"The solve found an impossible lens: {words}."
     assert error.value.hint and error.value.exit_code == ExitCode.SOLVE
 
 
@@ -83,9 +83,9 @@ def test_lenses_that_cameras_have_pass_and_so_does_one_that_was_given():
 
 def test_a_given_focal_length_that_was_held_or_left_is_said():
     held = lens_remarks(answer(800.0, held=True, doubt="off", found_px=1200.0, given_px=800.0))
-    assert held[0][0].endswith("(1200 px instead of 800): it was held as given.")
+    assert held[0][0].endswith("(1200 px instead of 800), but it is kept fixed.")
     left = lens_remarks(answer(1200.0, doubt="off", given_px=800.0))
-    assert left[0][0] == "The focal length came out as 1200 px, and 800 were given."
+    assert left[0][0] == "The solved focal length is 1200 px, but 800 px was set."
 
 
 def solved(folder, tools, pictures, **request):
@@ -112,7 +112,7 @@ def test_a_focal_length_of_the_file_is_what_a_clip_gets_that_does_not_tell_its_o
     found, _ = solved(tmp_path, tools, pictures, start_focal_px=310.0)
     assert found["focal_px"] == 310.0 and found["lens"]["held"] and not found["lens"]["given_px"]
     ((said, _),) = lens_remarks(found)
-    assert said.endswith("the one that the file names was taken, 55 degrees wide.")
+    assert said.endswith("the lens stated in the file is used, 55 degrees wide.")
 
 
 def test_a_fisheye_is_solved(tmp_path, tools):

@@ -75,7 +75,7 @@ def error_px(lens, beyond=0.0):
 def test_both_ways_and_overscan_give_the_same_lens(tmp_path):
     lens, heard = read(written(tmp_path, undistorting()))
     assert error_px(lens) < 1e-3, "also in the corners, which are not in this map"
-    assert ["ends before the original picture does" in one for one in heard] == [True]
+    assert ["does not cover the whole original picture" in one for one in heard] == [True]
     assert lens.window == (1.0, 1.0)
     wide, heard = read(written(tmp_path, undistorting(beyond=0.2)))
     assert error_px(wide, 0.2) < 1e-3 and heard == []
@@ -115,7 +115,7 @@ def test_overscan_as_a_data_window_beyond_the_picture(tmp_path):
 def test_t_may_run_down_and_that_is_said(tmp_path):
     lens, heard = read(written(tmp_path, undistorting(beyond=0.2) * [1, -1] + [0, 1]))
     assert error_px(lens, 0.2) < 1e-3
-    assert heard == ["The ST map map.exr counts t from the top: it is taken so."]
+    assert heard == ["The ST map map.exr counts t from the top, and is read that way."]
 
 
 def test_sixteen_bits_are_smoothed(tmp_path):
@@ -168,7 +168,7 @@ def test_anamorphic_footage_in_its_own_pixels_or_square_ones(tmp_path):
     for made in (st, 0.5 * (st[:, ::2] + st[:, 1::2])):
         lens, _ = read(written(tmp_path, made), **told)
         assert error_px(lens, 0.2) < 0.05 and lens.window[0] == pytest.approx(lens.window[1], abs=0.01)
-    with pytest.raises(JobError, match="another shape"):
+    with pytest.raises(JobError, match="aspect ratios differ"):
         read(written(tmp_path, st[:, ::2]))
 
 
@@ -201,16 +201,16 @@ def moved(st):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (noisy, r"no smooth map of a lens: at column \d+, row \d+ it is \d\.\d\d pixels off"),
-        (holed, r"holds 1 pixels that are no numbers \(NaN\), the first at column 9, row 7"),
+        (noisy, r"not a smooth map of a lens: at column \d+, row \d+ it differs by \d\.\d\d pixels"),
+        (holed, r"contains 1 pixels that are not numbers \(NaN\), the first at column 9, row 7"),
         (folded, r"folds over: at \d+ % of the width"),
-        (moved, r"bends nothing, but moves the whole picture by -1\.00 and -1\.00 pixels"),
-        (lambda st: st * [WIDTH, HEIGHT], r"holds pixels \(up to 3\d\d\), not shares"),
-        (lambda st: st - moved(st) + 0.001, "holds no places: red grows by"),
+        (moved, r"has no distortion, but moves the whole picture by -1\.00 and -1\.00 pixels"),
+        (lambda st: st * [WIDTH, HEIGHT], r"contains pixels \(up to 3\d\d\) instead"),
+        (lambda st: st - moved(st) + 0.001, "contains no coordinates: red grows by"),
         (lambda st: st[:, ::-1], "is mirrored"),
-        (lambda st: st[..., ::-1], "s and t in each other's place"),
-        (lambda st: np.zeros_like(st), "has coordinates in 0 % of its picture only"),
-        (lambda st: four_to_three(), "is 320 x 240, the footage 640 x 360: it is of a picture of another shape"),
+        (lambda st: st[..., ::-1], "has s and t swapped"),
+        (lambda st: np.zeros_like(st), "has coordinates in only 0 % of its picture"),
+        (lambda st: four_to_three(), "is 320 x 240, the footage 640 x 360: their aspect ratios differ"),
     ],
     ids=["noise", "NaN", "fold", "identity with an offset", "pixels", "displacement", "mirrored", "swapped", "black",
          "shape"],
@@ -223,13 +223,13 @@ def test_what_is_no_map_of_this_lens_is_refused_in_a_sentence(tmp_path, change, 
 
 
 def test_a_map_of_the_other_picture_s_shape_is_refused_the_other_way_round_too(tmp_path):
-    with pytest.raises(JobError, match="another shape"):
+    with pytest.raises(JobError, match="aspect ratios differ"):
         read(written(tmp_path, redistorting()[:, 40:280]), "redistort")
 
 
 def test_eight_bits_and_what_is_no_file_are_refused(tmp_path):
     st = np.clip(undistorting(), 0, 1)
-    with pytest.raises(JobError, match="8 bits a channel"):
+    with pytest.raises(JobError, match="8 bits per channel"):
         read(written(tmp_path, st, oiio.UINT8, name="map.png"))
     (tmp_path / "text.exr").write_text("no picture")
     for path in (tmp_path / "text.exr", tmp_path / "gone.exr", tmp_path):
@@ -242,7 +242,7 @@ def test_eight_bits_and_what_is_no_file_are_refused(tmp_path):
 
 def test_a_map_that_bends_nothing_is_taken_and_said(tmp_path):
     lens, heard = read(written(tmp_path, places(WIDTH, HEIGHT) / [WIDTH, HEIGHT] * [1, -1] + [0, 1]))
-    assert lens.is_none and lens.window == (1.0, 1.0) and "bends nothing" in heard[0]
+    assert lens.is_none and lens.window == (1.0, 1.0) and "has no distortion" in heard[0]
 
 
 def test_files_are_told_apart_by_what_is_in_them(tmp_path):

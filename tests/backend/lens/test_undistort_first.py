@@ -104,12 +104,12 @@ def test_a_map_the_wrong_way_round_is_noticed(clip, tools, tmp_path):
     report = tools.recorder()
     config = SolveConfig(features=800, st_map=str(folder / "redistort.exr"), retry=False)
     solve_shot(Shot(shot.root), config, report)
-    assert [w for w in report.warnings if "Through the ST map the frames are still bent, by" in w]
+    assert [w for w in report.warnings if "The ST map does not straighten the frames: they are still bent by" in w]
 
 
 def test_other_cameras_and_a_map_are_one_lens_too_many(clip, tools):
     shot, _, folder = clip
-    with pytest.raises(JobError, match="bring their own lens") as refused:
+    with pytest.raises(JobError, match="already have a lens") as refused:
         solve_shot(shot, SolveConfig(st_map=str(folder / "undistort.exr")), tools.recorder(), cameras=str(folder))
     assert refused.value.exit_code == ExitCode.USAGE
     with pytest.raises(ValueError, match="st_map_way"):

@@ -246,7 +246,7 @@ def test_a_clip_that_cannot_be_learnt_is_left_to_flow_with_a_word(swaying, tmp_p
     shutil.rmtree(shot.motion)
     assert find_motion(shot, report, static_model=refuse) == swaying[2]
     told = [event[1:] for event in report.events if event[0] == "warning"]
-    assert told == [("What moves is told by optical flow alone: The camera hardly moves.", "Walk.")]
+    assert told == [("Motion is found by optical flow only: The camera hardly moves.", "Walk.")]
 
 
 def test_what_neither_a_static_model_nor_most_frames_show_moves(tmp_path, quiet):
@@ -506,7 +506,7 @@ def test_paint_that_announces_too_many_pixels_is_refused_before_they_are_read(ow
     content[16:24] = struct.pack(">II", 16000, 16000)
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
     file.write_bytes(content)
-    with pytest.raises(JobError, match=r"001001\.png is 16000 x 16000 pixels, or says so"):
+    with pytest.raises(JobError, match=r"001001\.png is 16000 x 16000 pixels according to its header"):
         load_motion(own, NUMBERS[0])
 
 

@@ -111,7 +111,7 @@ def test_st_maps_of_the_lens_before_go_and_that_is_said(again, tools):
     report = tools.recorder()
     solve_shot(shot, SolveConfig(), report, cameras)
     assert not any(path.exists() for path in maps)
-    assert "The ST maps of the solve before were of its lens: they are gone." in report.warnings
+    assert "The ST maps of the previous solve were for its lens and have been removed." in report.warnings
     report = tools.recorder()
     solve_shot(shot, SolveConfig(), report, cameras)
     assert not any("ST maps" in told for told in report.warnings)

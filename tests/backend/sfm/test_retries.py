@@ -130,7 +130,7 @@ def test_a_clip_that_the_first_try_cannot_take_is_solved_with_more_features_and_
     assert record["rung"] == "features" and [told["rung"] for told in record["tries"]] == ["first", "features"]
     assert record["tries"][1]["found"] == record["quality"]
     assert report.warnings[0].startswith("The frames show too little to match: ")
-    assert report.warnings[0].endswith("Trying again with up to 2000 features a frame, faint ones too.")
+    assert report.warnings[0].endswith("Trying again with up to 2000 features per frame, including faint ones.")
     assert record["focal_px"] == pytest.approx(300.0, rel=0.02)
     # The log has the output of both attempts, and their other files are removed.
     assert not (fog.solve / "scratch").exists() and (fog.solve / "colmap.log").stat().st_size
@@ -138,7 +138,7 @@ def test_a_clip_that_the_first_try_cannot_take_is_solved_with_more_features_and_
 
 def test_without_retrying_it_is_refused_for_what_it_is(fog, tools):
     report = tools.recorder()
-    with pytest.raises(JobError, match="^The frames show too little to match: about ") as error:
+    with pytest.raises(JobError, match="^The frames show too little to match: a frame has about ") as error:
         solve_shot(fog, SolveConfig(features=1000, retry=False), report)
     assert report.warnings == [] and "Tried" not in error.value.hint and "more light and texture" in error.value.hint
 
@@ -173,8 +173,8 @@ def test_a_fisheye_that_was_taken_for_an_ordinary_lens_is_solved_as_one(tmp_path
     assert best.answer["result"]["camera_model"] == "OPENCV_FISHEYE"
     assert best.answer["result"]["focal_px"] == pytest.approx(focal, rel=0.02)
     assert report.warnings == [
-        "The lens came out as one that folds the picture over, and a usual one was taken. "
-        "Trying again with the lens of a fisheye (OPENCV_FISHEYE)."
+        "The solved lens folds the picture over, so a typical lens is used. "
+        "Trying again with a fisheye lens (OPENCV_FISHEYE)."
     ]
     assert {p.name for p in (tmp_path / "first").iterdir()} <= {"database.db"}
 
@@ -190,7 +190,7 @@ def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path
         solve_with_retries(request, frames, True, tmp_path, tmp_path / "log.txt", report)
     assert error.value.message.startswith("Cameras were found for only ")
     assert error.value.hint.endswith(
-        "Tried in vain: more features, more pairs, another lens model and the global mapper."
+        "Tried without success: more features, more pairs, another lens model and the global mapper."
     )
     assert [w.split("Trying again with ")[1].split()[-1] for w in report.warnings] == [
         "too.",

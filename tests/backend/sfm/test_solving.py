@@ -157,7 +157,7 @@ def test_a_solve_holds_without_its_motion_matte_and_the_next_one_finds_it(solved
     result = solve_all(shot, SolveConfig(features=1500), report)
     assert "motion_pixels_share" not in result and result["registered"] == 11
     (said,) = report.warnings
-    assert said.startswith("What moves by itself could not be told from the pictures: ") and "is not a folder" in said
+    assert said.startswith("Moving areas could not be found: ") and "is not a folder" in said
     (shot.solve / "motion").unlink()
     assert solve_all(shot, SolveConfig(features=1500), tools.recorder()) == solved.result
 
@@ -200,7 +200,7 @@ def test_frames_that_cannot_be_placed_are_filled_in_and_said(tmp_path, tools):
     assert result["quality"].startswith("Fair: 12 of 14 frames registered")
     assert report.warnings == [
         "The mapper did not register 2 solved frames: frames 105, 114.",
-        "The camera holds its pose in frame 114, beyond the last frame that was placed.",
+        "The camera holds its pose before the first or after the last solved frame: frame 114.",
     ]
 
 
@@ -221,13 +221,16 @@ def names(*frames):
     [
         (
             {"triangulation_angle_deg": 1.6},
-            "The camera moves too little for depth: half of the points are seen under 1.6 degrees or less.",
+            "The camera moves too little for depth: the parallax of half of the points is 1.6 degrees or less.",
         ),
         (
             {"registered": 13, "turning": True, "parts": [names(*range(3, 16))]},
-            "The camera only turns on the spot: there is nothing to tell depth by.",
+            "The camera only turns on the spot, so depth cannot be estimated.",
         ),
-        ({"points": 40}, "Only 40 points of the scene could be placed: the clip is too blurred or too bare."),
+        (
+            {"points": 40},
+            "Only 40 points of the scene could be placed: the clip is too blurred or has too little texture.",
+        ),
     ],
 )
 def test_models_that_nothing_could_be_trained_on_are_refused(changes, message):
@@ -257,8 +260,8 @@ def test_models_that_nothing_could_be_trained_on_are_refused(changes, message):
             3,
             [names(*range(13, 38, 3))],
             "Cameras were found for only 9 of 25 frames: 13 to 37.",
-            "Frames 13 to 37 worked: import that range, or one without fast pans or blur. A smaller step shows more of "
-            "each to the next.",
+            "Frames 13 to 37 worked: import that range, or one without fast pans or blur. A smaller step makes "
+            "neighbouring frames overlap more.",
         ),
         (
             1,
@@ -291,8 +294,8 @@ def test_a_failed_solve_leaves_colmaps_last_words_in_the_job_s_log(tmp_path, too
 @pytest.mark.parametrize(
     ("focal", "message"),
     [
-        (13_000.0, "The solve found a lens that no camera has: 2.8 degrees wide (13000 px)."),
-        (60.0, "The solve found a lens that no camera has: 158.8 degrees wide (60 px)."),
+        (13_000.0, "The solve found an impossible lens: 2.8 degrees wide (13000 px)."),
+        (60.0, "The solve found an impossible lens: 158.8 degrees wide (60 px)."),
     ],
 )
 def test_a_lens_that_no_camera_has_is_refused(focal, message):
@@ -309,8 +312,8 @@ def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
     record = read_json(shot.solve / "solve.json")
     assert (record["focal_px"], record["distortion"]) == (1.2 * 320, [0.0])
     assert record["registered"] == 10 and record["triangulation_angle_deg"] > 8
-    assert report.warnings[0].startswith("The clip does not tell its lens (the solve ran off to ")
-    assert report.warnings[0].endswith("a usual one of 45 degrees was taken.")
+    assert report.warnings[0].startswith("The lens cannot be estimated from this clip (the solve diverged to ")
+    assert report.warnings[0].endswith("a typical lens of 45 degrees is used.")
 
 
 @pytest.mark.parametrize(
@@ -318,8 +321,11 @@ def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
     [
         ({"doubt": "", "held": False}, []),
         ({"doubt": "narrow", "held": False}, ["is unusual: 10 degrees wide."]),
-        ({"doubt": "bent", "held": False}, ["bends the picture more than lenses do."]),
-        ({"doubt": "narrow", "held": True}, ["(the solve ran off to 3 degrees): a usual one of 10 degrees was taken."]),
+        ({"doubt": "bent", "held": False}, ["The distortion of the solved lens is unusually strong."]),
+        (
+            {"doubt": "narrow", "held": True},
+            ["(the solve diverged to 3 degrees): a typical lens of 10 degrees is used."],
+        ),
     ],
 )
 def test_a_doubtful_lens_is_said(lens, words):
@@ -347,7 +353,7 @@ def test_a_still_camera_is_refused(tmp_path, tools):
 
 def test_a_camera_that_only_turns_is_refused(tmp_path, tools):
     shot = imported(tmp_path, tools, [tools.look([0, 0, 0], yaw=0.03 * i) for i in range(9)])
-    assert refused(shot, tools) == "The camera only turns on the spot: there is nothing to tell depth by."
+    assert refused(shot, tools) == "The camera only turns on the spot, so depth cannot be estimated."
 
 
 def test_cancelling_kills_the_worker_and_leaves_nothing_half_done(tmp_path, tools):
@@ -360,7 +366,7 @@ def test_cancelling_kills_the_worker_and_leaves_nothing_half_done(tmp_path, tool
 
 def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, tools):
     (tmp_path / "request.json").write_text(json.dumps({"images": str(tmp_path)}))
-    with pytest.raises(JobError, match="The camera solve broke off") as error:
+    with pytest.raises(JobError, match="The camera solve failed") as error:
         run_worker(tmp_path / "request.json", tmp_path / "log.txt", tools.recorder())
     assert error.value.exit_code == ExitCode.SOLVE
     assert "KeyError" in error.value.message

@@ -71,7 +71,7 @@ def test_a_camera_that_pans_on_its_tripod(tmp_path, tools, sitting):
         moved = cv2.warpPerspective(picture, lens @ turn @ np.linalg.inv(lens), (320, 240), flags=cv2.INTER_CUBIC)
         pictures.append((moved + rng.normal(0.0, 2.0, moved.shape))[36:204, 48:272])
     message, _, warnings = refused(tools, tmp_path, clip(tmp_path, pictures))
-    assert message == "The camera only turns on the spot: there is nothing to tell depth by." and warnings == []
+    assert message == "The camera only turns on the spot, so depth cannot be estimated." and warnings == []
 
 
 def test_a_range_that_is_too_short(tools, sitting):
@@ -98,5 +98,5 @@ def test_a_fisheye_taken_for_an_ordinary_lens(tmp_path, tools):
     rays = tools.fisheye_rays(120.0, 0.0)
     source = clip(tmp_path, [tools.room().cast(pose, rays) for pose in tools.handheld(9)])
     message, hint, _ = refused(tools, tmp_path, source, retry=False)
-    assert message.startswith("The solve found a lens that no camera has: it folds the picture over")
-    assert hint.startswith("Choose Fisheye as the lens (--camera-model OPENCV_FISHEYE) if it is one")
+    assert message.startswith("The solve found an impossible lens: it folds the picture over")
+    assert hint.startswith("If the lens is a fisheye, choose Fisheye (--camera-model OPENCV_FISHEYE)")

@@ -104,7 +104,7 @@ def test_an_extension_of_other_length_begins_anew_and_says_so(world, quiet, fini
         train_shot(world.shot, more("ext-other"), quiet(cancel_at=("training", 0.5)))
     report = quiet()
     assert train_shot(world.shot, more("ext-other", 20), report)["iterations"] == 80
-    assert any(e[0] == "warning" and "40 steps were begun, 20 are asked for" in e[1] for e in report.events)
+    assert any(e[0] == "warning" and "40 steps were started, but 20 are requested" in e[1] for e in report.events)
     rows = [json.loads(line)["iteration"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert rows == [*range(6, 61, 6), *range(62, 81, 2)]
 

@@ -116,7 +116,7 @@ def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(sh
     config, key, _ = identity.requested_identity(shot, scene, shot.run("f"), asked, card, report, [])
     assert not config.plates and key == json.loads((shot.run("f") / "config.json").read_text())["key"]
     assert [event[1] for event in report.events] == [
-        "The run was begun with the preset's numbers for the processor: it goes on with them."
+        "The run was started with the preset's settings for the processor, and continues with them."
     ]
     again = TrainParams(**{**vars(asked), "resume": False})
     assert identity.requested_identity(shot, scene, shot.run("f"), again, card, quiet(), [])[0].plates
@@ -131,7 +131,7 @@ def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(sh
     assert train_shot(shot, resumed, report)["width_px"] == 128
     assert any(event[0] == "progress" and "resumed at step" in event[4] for event in report.events)
     warned = [event[1] for event in report.events if event[0] == "warning"]
-    assert warned[0] == "The run was begun with the preset's numbers for a graphics card: it goes on with them."
+    assert warned[0] == "The run was started with the preset's settings for a graphics card, and continues with them."
     report = quiet()
     assert train_shot(shot, on_card, report)["width_px"] == 128
     assert ("progress", "training", 1, 1, "already trained") in report.events and not report.events[1:]

@@ -86,7 +86,7 @@ def test_where_only_the_fields_kernels_are_wrong_torch_stands_in_for_them(
     report = quiet()
     assert choose_device("auto", report, "Training").type == "cuda" and device.decide_device("auto")[1] is None
     ((_, sentence, advice),) = report.events
-    assert sentence.startswith("Training computes what moves with PyTorch's own operators") and found.planes in sentence
+    assert sentence.startswith("Training computes motion with PyTorch's own operators") and found.planes in sentence
     assert "doctor --gpu" in advice
     plane = torch.ones(1, 16, 3, 3).contiguous(memory_format=torch.channels_last)
     assert not planes_cuda.supports([plane])

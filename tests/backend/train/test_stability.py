@@ -107,9 +107,9 @@ def of_a_moment(trainer):
         (gaussian("opacity_logits", NAN), "dropped 1 Gaussian (opacity_logits not finite)"),
         (gaussian("sh0", NAN), "dropped 1 Gaussian (sh0 not finite)"),
         (gaussian("shN", NAN, row=slice(7, 9)), "dropped 2 Gaussians (shN not finite)"),
-        (without_length, "mended 1 Gaussian (quats without length)"),
-        (of_the_field, "mended 1 number of trunk.weight"),
-        (of_the_exposure, "mended 1 number of exposure"),
+        (without_length, "repaired 1 Gaussian (quats without length)"),
+        (of_the_field, "repaired 1 number of trunk.weight"),
+        (of_the_exposure, "repaired 1 number of exposure"),
         (of_a_moment, "cleared 1 moment of Adam"),
     ],
 )
@@ -147,7 +147,7 @@ def test_what_was_in_order_stays_as_it_was_row_by_row(begin):
     memory = [t[keep].clone() for t in (model.gaussians.open, model.gaussians.support, densifier.gradient)]
     said = repair(model, trainer.optimizer, densifier, trainer.soundness.memory, 30)
     assert "dropped 3 Gaussians (means, sh0 not finite)" in said
-    assert "mended 1 Gaussian (hyper not finite)" in said
+    assert "repaired 1 Gaussian (hyper not finite)" in said
     params["hyper"][4] = model.field.owned["hyper"].value
     params["quats"][5] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     moments["hyper"][4] = moments["quats"][5] = 0.0
@@ -179,7 +179,7 @@ def test_a_frame_with_bad_pixels_is_left_out_from_then_on(begin, supervision):
     count = len(trainer.model.gaussians)
     go_on(trainer, 19)
     (said,) = warnings(trainer)
-    assert f"left frame {trainer.scene.frames[trainer.train_ids[5]]} out" in said
+    assert f"excluded frame {trainer.scene.frames[trainer.train_ids[5]]} from the training" in said
     assert len(go_on(trainer, 40)) == 40  # with `paper`, some of these steps use a second frame
     assert len(warnings(trainer)) == 1
     assert finite(trainer)
@@ -222,7 +222,7 @@ def test_a_field_that_throws_gaussians_out_of_their_place_is_put_back(begin, hos
     assert float(trainer.step()) > 1.3 * loss
     trainer.inspect_nonfinite()
     (said,) = warnings(trainer)
-    assert "put the field back" in said
+    assert "restored the field" in said
     for name, p in trainer.model.field.named_parameters():
         assert torch.equal(p, before[name])
     halved = [now["lr_start"] / was for now, was in zip(trainer.optimizer.param_groups, rates, strict=True)]
@@ -334,7 +334,7 @@ def test_a_resumed_run_drops_who_is_thrown_as_an_unbroken_one_does(begin, tmp_pa
     restore_run(resumed, tmp_path / "checkpoint.safetensors")
     memory = resumed.soundness.memory
     assert drop_displaced(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(thrown.sum())
-    assert worst > 0 and "put the field back" in memory.restore_stable(resumed.model.field, resumed.optimizer)
+    assert worst > 0 and "restored the field" in memory.restore_stable(resumed.model.field, resumed.optimizer)
     assert trainer.soundness.memory.restore_stable(trainer.model.field, trainer.optimizer)
     for (name, p), (_, other) in zip(trainer.model.field.named_parameters(), resumed.model.field.named_parameters()):
         assert torch.equal(p, other), name

@@ -66,7 +66,7 @@ def test_frames_too_many_for_the_memory_train_the_same_run_from_a_file_that_nobo
 def test_frames_that_no_disk_holds_are_refused_in_a_sentence(world, monkeypatch):
     monkeypatch.setattr(torch_backend.scene, "IMAGE_MEMORY_BYTES", 0)
     scene = load_scene(world.shot)
-    with pytest.raises(JobError, match=r"No space left in .*Frames for the training.* needs about \d+ MB"):
+    with pytest.raises(JobError, match=r"No space left in .*training frames.* needs about \d+ MB"):
         load_images(scene, scene.solved, 1_000_000, 1_000_000, folder=world.shot.root)
 
 
@@ -247,7 +247,7 @@ def test_a_finished_run_stays_until_one_of_other_settings_is_done(world, quiet):
     with pytest.raises(Cancelled):
         train_shot(world.shot, short(world, "mixed", seed=5), report)
     assert files_of(run) == before
-    assert any(e[0] == "warning" and "trained anew" in e[1] and "stays" in e[2] for e in report.events)
+    assert any(e[0] == "warning" and "training starts again" in e[1] and "is kept" in e[2] for e in report.events)
     assert load_run(world.shot, "mixed").config.seed == 0
     (work,) = begun_in(run)
     stopped = iteration_of(work)

@@ -115,7 +115,7 @@ class Instants:
             problem = error if isinstance(error, JobError) else path_error(error)
             reason = f"{error}." if problem is None else problem.message
             report.warning(
-                f"The developed instant is not kept: {reason}", "The next freeze at this t* develops it again."
+                f"The developed instant was not saved: {reason}", "The next freeze at this t* develops it again."
             )
         return instant
 

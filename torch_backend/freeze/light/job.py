@@ -124,7 +124,7 @@ def _rendered(
     except ValueError:
         raise JobError(
             "No splat of the take is seen from that point.",
-            "Choose a point inside of what the clip shows.",
+            "Choose a point within the area that the clip shows.",
             ExitCode.USAGE,
         ) from None
     facts = LightFacts("", [float(x) for x in point], share, placement.to_json())
@@ -213,7 +213,7 @@ def _exposed(shot: Shot, facts: dict[str, Any], scene: Scene, colors: Tensor, re
         run = None
     if run is None or run.stamp != facts.get("checkpoint"):
         report.warning(
-            "The run of this take was trained or removed since: the light has its mean exposure, not the one at t*.",
+            "The run of this take was trained again or removed: the light has the mean exposure, not the one at t*.",
             "Freeze the take again.",
         )
         return colors

@@ -73,7 +73,9 @@ class Source:
         path = matte_file(self.folder, name, frame, self.matte_format)
         if not is_current(path, self.matte_keys[name]):
             raise JobError(
-                f"The matte {name} of take {self.name} lacks frame {frame}.", "Make the mattes again.", ExitCode.FREEZE
+                f"The matte {name} of take {self.name} lacks frame {frame}.",
+                "Create the mattes again.",
+                ExitCode.FREEZE,
             )
         return read_matte(path, self.margin)
 
@@ -99,7 +101,7 @@ def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, An
     sources = {name: None if name == LIVE_SOURCE else _opened(shot, name) for name in dict.fromkeys(things.values())}
     frames = _check(base, things, sources)
     if base.facts.get("deep"):
-        report.warning("A combined take has no deep EXRs.", "Combine those of its takes by their mattes.")
+        report.warning("A combined take has no deep EXRs.", "Combine the deep EXRs of its takes with their mattes.")
     folder = TakeFolder(shot.own(shot.take(checked_name(params.take, "take"))))
     _refuse_frozen(folder, params)
     live = Plates(shot, (int(base.facts["width"]), int(base.facts["height"]))) if None in sources.values() else None
@@ -133,7 +135,7 @@ def things_of(text: str) -> dict[str, str]:
             )
         found[checked_name(matte, "matte")] = checked_name(take, "take")
     if not found:
-        raise JobError("Nothing is said of what comes from which take.", "Write --things MATTE=TAKE.", ExitCode.USAGE)
+        raise JobError("Nothing says which thing comes from which take.", "Write --things MATTE=TAKE.", ExitCode.USAGE)
     return found
 
 
@@ -218,14 +220,14 @@ def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source
             if candidate is not None and matte not in candidate.matte_keys:
                 raise JobError(
                     f"Take {candidate.name} has no matte {matte!r}.",
-                    "Draw it there, or make its mattes.",
+                    "Draw it there, or create its mattes again.",
                     ExitCode.FREEZE,
                 )
         if source is None:
             if base.facts.get("camera_path"):
                 raise JobError(
-                    f"{matte} cannot live in take {base.name}: it is seen from a camera of its own, and only the "
-                    "clip's own shows the plate.", "Use a take from the clip's own poses.", ExitCode.FREEZE,
+                    f"{matte} cannot keep moving in take {base.name}, which has another camera: only the clip's own "
+                    "camera shows the plate.", "Use a take with the clip's own camera.", ExitCode.FREEZE,
                 )  # fmt: skip
             continue
         placed = ("placement",) if base.facts.get("passes") else ()  # the layer Position depends on it
@@ -247,7 +249,7 @@ def _refuse_frozen(folder: TakeFolder, params: CombineParams) -> None:
         folder.facts.is_file() and "combined" not in read_json(folder.facts)
     ):
         raise JobError(
-            f"The take {params.take} holds frozen frames: a combined one would take their place.",
+            f"The take {params.take} contains frozen frames, which a combined take would replace.",
             "Give it another name with --take.", ExitCode.USAGE,
         )  # fmt: skip
 

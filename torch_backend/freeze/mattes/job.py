@@ -124,8 +124,8 @@ def _opened(shot: Shot, name: str) -> _Take:
         raise JobError(f"{folder.facts} is damaged.", "Freeze the take again.", ExitCode.FREEZE)
     if "combined" in facts:  # mattes are propagated by the frozen scene of a single instant
         raise JobError(
-            f"The take {name} is combined from others: its mattes would be those of one instant alone.",
-            "Make the mattes in the takes that it was combined from.", ExitCode.USAGE,
+            f"The take {name} is combined from others: its mattes would only be right for one instant.",
+            "Create the mattes in the takes that it was combined from.", ExitCode.USAGE,
         )  # fmt: skip
     return _Take(folder, facts, frames_of(folder))
 
@@ -143,11 +143,12 @@ def _lassos(take: _Take, params: MatteParams) -> list[Lasso]:
         names = {lasso.name for lasso in added}
         lassos = [lasso for lasso in lassos if lasso.name not in names] + added
     if not lassos and not params.remove:
-        raise JobError("The take has no lassos yet.", "Give a file of them with --polygons.", ExitCode.USAGE)
+        raise JobError("The take has no lassos yet.", "Provide a file of lassos with --polygons.", ExitCode.USAGE)
     folded = [name.casefold() for name in dict.fromkeys(lasso.name for lasso in lassos)]
     if len(set(folded)) < len(folded):
         raise JobError(
-            "Two mattes have names that differ in capitals alone: their folders would be one on some systems.",
+            "Two mattes have names that differ only in upper and lower case: on some systems their folders would be "
+            "the same.",
             "Rename one of them.",
             ExitCode.USAGE,
         )
@@ -156,13 +157,13 @@ def _lassos(take: _Take, params: MatteParams) -> list[Lasso]:
         if lasso.frame not in take.frames:
             span = f"frames {take.frames[0]} to {take.frames[-1]}" if take.frames else "none"
             raise JobError(
-                f"{lasso.name} was lassoed at frame {lasso.frame}, which the take lacks: it has {span}.",
+                f"{lasso.name} was lassoed at frame {lasso.frame}, which is not in the take: it has {span}.",
                 "Lasso it at a frame of the take.",
                 ExitCode.USAGE,
             )
         if x.max() <= 0.0 or y.max() <= 0.0 or x.min() >= size[0] or y.min() >= size[1]:
             raise JobError(
-                f"The lasso of {lasso.name} lies outside of frame {lasso.frame}, of {size[0]} x {size[1]} pixels.",
+                f"The lasso of {lasso.name} lies outside frame {lasso.frame}, which is {size[0]} x {size[1]} pixels.",
                 "Draw it within the frame.",
                 ExitCode.USAGE,
             )
@@ -212,7 +213,7 @@ def _carried(
     run = load_run(shot, str(take.facts["run"]), choose_device(params.device, report, "Making mattes"))
     if run.stamp != take.facts["checkpoint"]:
         raise JobError(
-            f"The run {take.facts['run']!r} was trained since the take was frozen: they do not belong together.",
+            f"The run {take.facts['run']!r} was trained after the take was frozen, so the two do not match.",
             "Freeze the take again.",
             ExitCode.FREEZE,
         )

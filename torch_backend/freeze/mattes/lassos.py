@@ -54,7 +54,7 @@ def read_lassos(path: str | Path, width: int, height: int) -> list[Lasso]:
         raise JobError(f"{path} does not exist.", "Check the name of the file of lassos.", ExitCode.USAGE) from None
     rows = json_list(data.get("mattes", [data] if "polygon" in data else None))
     if not rows:
-        raise JobError(f"{path} holds no lasso.", _FORM, ExitCode.USAGE)
+        raise JobError(f"{path} contains no lasso.", _FORM, ExitCode.USAGE)
     return [lasso_of(row, f"Lasso {n} of {path}", width, height) for n, row in enumerate(rows, 1)]
 
 
@@ -64,13 +64,13 @@ _FORM = 'Write {"mattes": [{"name": "a name", "frame": 1, "polygon": [[x, y], [x
 def lasso_of(row: object, what: str, width: int, height: int) -> Lasso:
     """One lasso from JSON. JobError if it is invalid; `what` is its name in the message."""
     if not is_json_object(row):
-        raise JobError(f"{what} is no JSON object.", _FORM, ExitCode.USAGE)
+        raise JobError(f"{what} is not a JSON object.", _FORM, ExitCode.USAGE)
     name, frame, polygon = row.get("name"), row.get("frame"), row.get("polygon")
     if not isinstance(name, str):
         raise JobError(f"{what} has no name.", _FORM, ExitCode.USAGE)
     checked_name(name, "matte")
     if not isinstance(frame, int) or isinstance(frame, bool):
-        raise JobError(f"{what} says no frame: {frame!r} should be a whole number.", _FORM, ExitCode.USAGE)
+        raise JobError(f"{what} has no valid frame: {frame!r} should be a whole number.", _FORM, ExitCode.USAGE)
     drawn = json_list(polygon)
     if not 3 <= len(drawn) <= MOST_CORNERS:
         raise JobError(f"{what} has no polygon of at least 3 corners.", _FORM, ExitCode.USAGE)

@@ -55,13 +55,13 @@ def make_surface(
     if facts.get("t_star_per_frame"):
         raise JobError(
             f"Time does not stand still in the take {params.take!r}: its t* was keyed.",
-            "Freeze a take at one instant, and make the surface of that.",
+            "Freeze a take at one instant, and create its surface.",
             ExitCode.USAGE,
         )
     if _has_living(facts):
         raise JobError(
-            f"Something lives on in the take {params.take!r}: it has no shape that holds for all frames.",
-            "Make the surface of the take that it was combined from.",
+            f"Something keeps moving in the take {params.take!r}, so no surface fits all frames.",
+            "Create the surface of the take that it was combined from.",
             ExitCode.USAGE,
         )
     key = file_digest(folder.facts)
@@ -105,7 +105,7 @@ def _fused(folder: TakeFolder, config: SurfaceConfig, report: Reporter) -> Surfa
         views.append(view_of(folder.frame(number), config))
     seen = [v.depth[v.depth > 0] for v in views]
     if not any(len(depth) for depth in seen):
-        raise JobError("The frames of the take show no depth.", "Freeze the take again.", ExitCode.FREEZE)
+        raise JobError("The frames of the take have no depth.", "Freeze the take again.", ExitCode.FREEZE)
     far = float(np.quantile(np.concatenate(seen), config.far))
     for view in views:
         view.depth[view.depth > far] = 0.0

@@ -96,9 +96,9 @@ def stored_key(folder: TakeFolder, frame: int, spec: FrameSpec) -> str | None:
 def unkeyed_warning(take: str) -> tuple[str, str]:
     """(warning, hint) about a take with frames of an earlier version."""
     return (
-        f"Frames of the take {take} were made by an earlier version, whose files do not say which belong together: "
-        "they are made again.",
-        "Name another take to keep them.",
+        f"Frames of the take {take} were written by an earlier version, which did not record which belong together: "
+        "they are rendered again.",
+        "Choose another take name to keep them.",
     )
 
 
@@ -111,9 +111,9 @@ def outdated(take: PlannedTake, kept: Set[int]) -> tuple[str, str] | None:
     if not removed:
         return None
     return (
-        f"Frames of the take {take.folder.root.name} that show another instant or have other settings are removed and "
-        f"not rendered again: {len(removed)}.",
-        "Freeze the whole range to have them again, or name another take to keep them.",
+        f"Frames of the take {take.folder.root.name} with another instant or other settings are removed and not "
+        f"rendered again: {len(removed)}.",
+        "Freeze the whole range to render them again, or choose another take name to keep them.",
     )
 
 
@@ -148,8 +148,8 @@ def make_folders(folder: TakeFolder, spec: FrameSpec) -> None:
     """Creates a take's folder. JobError if it contains numbered pictures from elsewhere."""
     if not folder.state.is_file() and _numbers(folder):
         raise JobError(
-            f"{folder.root} holds numbered pictures that were not made here.",
-            "Name another take, or move them away.",
+            f"{folder.root} contains numbered pictures that Splannequin did not write.",
+            "Choose another take name, or move them.",
             ExitCode.FREEZE,
         )
     _prepare(folder, spec)

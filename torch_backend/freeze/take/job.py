@@ -64,9 +64,7 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     facts = finish(shot, params, take, [f for f in take.whole if f.frame in frames_on_disk], shares, report)
     shot.update(t_star=take.t_star)
     if take.spec.run.stale:
-        report.warning(
-            "The run was trained while it was frozen: the take shows what it was before.", "Freeze it again."
-        )
+        report.warning("The run was trained during the freeze: the take shows its earlier state.", "Freeze it again.")
     return facts
 
 
@@ -177,7 +175,10 @@ def missable(name: str, report: Reporter) -> Generator[None]:
         known = None if is_disk_full(error) else path_error(error)
         if known is None:
             raise
-        report.warning(f"The {name} is not written: {known.message}", "The frames are. Close it, then freeze again.")
+        report.warning(
+            f"The {name} was not written: {known.message}",
+            "The frames were written. Close the file, then freeze again.",
+        )
 
 
 def _detail_record(

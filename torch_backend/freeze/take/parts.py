@@ -76,7 +76,7 @@ def freeze_part(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     render_frames(take, frames, done, report, lambda: _refuse_opened_anew(take))
     if take.spec.run.stale:
         raise JobError(
-            "The run was trained while it was frozen.", "Open the take again, then freeze its parts.", ExitCode.FREEZE
+            "The run was trained during the freeze.", "Open the take again, then freeze its parts.", ExitCode.FREEZE
         )
     return {"frames": len(frames), "rendered": len(frames) - len(done)}
 
@@ -125,7 +125,8 @@ def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
         raise JobError(
             f"Take {params.take} of {shot.root.name} was opened with another run, other footage or other settings than "
             "this computer sees.",
-            "See that the footage can be read here and that nobody trains the run, then run the step `open` again.",
+            "Make sure that the footage can be read here and that the run is not being trained, then run the step "
+            "`open` again.",
             ExitCode.FREEZE,
         )
     return take
@@ -139,7 +140,7 @@ def _refuse_opened_anew(take: PlannedTake) -> None:
         state = {}
     if state.get("frames") != take.all_keys:
         raise JobError(
-            f"The take {take.folder.root.name} was opened with something else while a part of it was frozen.",
+            f"The take {take.folder.root.name} was opened with other settings while a part of it was frozen.",
             "Freeze the parts of the job that opened it last.",
             ExitCode.FREEZE,
         )
@@ -150,7 +151,7 @@ def _refuse_undeveloped(take: PlannedTake) -> None:
     lacking = [int(t) for t in take.spec.instants.keys if not take.spec.instants.is_stored(t)]
     if lacking:
         raise JobError(
-            f"The developed instant {lacking[0]} is not kept with the run.",
-            "Run the step `open` again; it says why, if it cannot be written.",
+            f"The developed instant {lacking[0]} is missing from the run.",
+            "Run the step `open` again: it reports why the instant cannot be saved.",
             ExitCode.FREEZE,
         )

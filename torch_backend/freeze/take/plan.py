@@ -186,8 +186,8 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     blur, placed = _motion_blur(whole, params, report), Similarity.of(placement_for(shot, params.placement))
     if params.deep and blur is not None:
         raise JobError(
-            "A motion-blurred take has no deep EXRs: what is blurred lies at no one depth.",
-            "Switch motion blur off, or Deep EXR.",
+            "A motion-blurred take has no deep EXRs: blurred pixels have no single depth.",
+            "Switch off motion blur or Deep EXR.",
             ExitCode.USAGE,
         )
     spec = FrameSpec(
@@ -208,8 +208,8 @@ def _motion_blur(whole: list[OutputFrame], params: FreezeParams, report: Reporte
         return None
     if not params.camera_path:
         report.warning(
-            "No motion blur is added on the clip's own camera path: its plates have that of the camera.",
-            "Choose a camera of your own to blur its move.",
+            "No motion blur is added on the clip's own camera path: its plates already have the camera's.",
+            "Choose another camera to blur its move.",
         )
         return None
     return MotionBlur(whole, params.shutter)
@@ -224,7 +224,7 @@ def _refuse_combined(folder: TakeFolder) -> None:
     if is_combined:
         raise JobError(
             f"The take {folder.root.name} is combined from others.",
-            "Freeze those and combine them again, or give this one another name.",
+            "Freeze its parts again and combine them, or choose another name for this take.",
             ExitCode.FREEZE,
         )
 
@@ -304,7 +304,8 @@ def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams
     nearest = int(trained[np.abs(trained - params.t_star).argmin()])
     if nearest != params.t_star:
         report.warning(
-            f"Frame {params.t_star} was not trained on: time stands still at frame {nearest}, the nearest that was."
+            f"Frame {params.t_star} was not trained on: time stands still at frame {nearest}, the nearest training "
+            "frame."
         )
     return nearest
 

@@ -33,7 +33,7 @@ from ..usd import NoUsdError, write_usd
 FORMATS = ("ply", "usd")
 _NO_USD = (
     "The backend has no usd-core, so the USD stage is not written.",
-    "Press Repair in the add-on's preferences, or run the setup of splannequin.py.",
+    "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
 )
 PLAIN_FPS = 24.0
 """Frames per second of a stage if the footage has no frame rate."""

@@ -52,7 +52,9 @@ def judge_take(
         return None
     limits, detail = limits or TakeLimits(), facts["detail"]
     if not detail or not detail["per_frame"]:
-        return _with_run(Verdict("fair", ["Its frames are splats alone, softer than the plate: Detail is off."]), run)
+        return _with_run(
+            Verdict("fair", ["Detail is off: its frames use only splats and are softer than the plate."]), run
+        )
     rows = detail["per_frame"]
     frames = [int(row["frame"]) for row in rows]
     cells = np.array([row["regions"] for row in rows], np.float64)
@@ -107,7 +109,7 @@ def _advice(
         sentences.append("If nothing moves there, paint it black in the motion matte.")
     worst = places[0] if places else None
     if facts.get("camera_path"):
-        sentences.append("Keep the camera nearer to the clip's own path there.")
+        sentences.append("Keep the camera closer to the clip's own path there.")
     elif worst is not None and not steady:
         middle = (worst["first"] + worst["last"]) // 2
         if advised:  # only suggest instants that the run's verdict recommends
@@ -116,7 +118,7 @@ def _advice(
             sentences.append(f"Try a t* nearer to frame {middle}.")
         span = _longer_part(frames, worst)
         if span is not None:
-            sentences.append(f"Or deliver frames {span[0]} to {span[1]}.")
+            sentences.append(f"Or deliver only frames {span[0]} to {span[1]}.")
     elif not sentences:
         sentences.append("Try another t*, or train a larger preset.")
     return sentences

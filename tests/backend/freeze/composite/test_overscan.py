@@ -100,7 +100,7 @@ def test_a_camera_of_ones_own_has_overscan_in_percent_and_no_map(trained, lens, 
     asked = {"take": "own", "t_star": 108, "camera_path": str(tmp_path / "path.json"), "width": 64}
     facts = freeze_shot(world.shot, FreezeParams(overscan=25.0, **asked), quiet())
     assert facts["margin"] == [16, 12] and facts["redistort"] == ""
-    with pytest.raises(JobError, match="clip's own camera only"):
+    with pytest.raises(JobError, match="only known for the clip's own camera"):
         freeze_shot(world.shot, FreezeParams(overscan=-1.0, **asked), quiet())
 
 

@@ -501,7 +501,9 @@ def test_where_it_cannot_be_kept_the_take_is_made_all_the_same(apart, trained, m
     ask = dict(t_star=T_STAR, first=105, last=106, detail="off", grain=False)
     assert freeze_shot(shot, FreezeParams(**ask), report)["developed"] == [T_STAR]
     told = [event[1] for event in report.events if event[0] == "warning"]
-    assert len(told) == 1 and told[0].startswith("The developed instant is not kept:") and "is not a folder" in told[0]
+    assert (
+        len(told) == 1 and told[0].startswith("The developed instant was not saved:") and "is not a folder" in told[0]
+    )
     assert (run.folder / "developed").read_text() == "in the way"
     freeze_shot(world.shot, FreezeParams(take="kept", **ask), quiet())
     pictures = [read_png(s.take(t) / "preview" / "000106.png") for s, t in ((shot, "freeze"), (world.shot, "kept"))]

@@ -114,8 +114,8 @@ def test_what_cannot_be_combined_is_said(world, quiet):
     refused("no matte 'dog'", things="dog=late")
     refused("no finished take 'never'", base="never")
     refused("names no matte and no take", things="patch")
-    refused("Nothing is said", things="")
-    with pytest.raises(JobError, match="holds frozen frames"):
+    refused("Nothing says which thing", things="")
+    with pytest.raises(JobError, match="contains frozen frames"):
         combine(world.shot, CombineParams(take="late", base="early", things="patch=late"), quiet())
     combine(world.shot, CombineParams(take="mine", base="early", things="patch=late"), quiet())
     with pytest.raises(JobError, match="combined from others"):
@@ -123,7 +123,7 @@ def test_what_cannot_be_combined_is_said(world, quiet):
     with pytest.raises(JobError, match="combined from others"):
         make_mattes(world.shot, MatteParams(take="mine"), quiet())
     combine(world.shot, CombineParams(take="mine", base="early", things="patch=live"), quiet())
-    with pytest.raises(JobError, match="lives on"):
+    with pytest.raises(JobError, match="keeps moving"):
         make_surface(world.shot, SurfaceParams(take="mine"), quiet())
     freeze_shot(world.shot, FreezeParams(take="wide", t_star=105, first=FIRST, last=LAST, width=128), quiet())
     refused("has no matte", base="wide")

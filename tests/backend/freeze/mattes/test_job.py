@@ -122,7 +122,7 @@ def test_a_cancelled_job_goes_on(take, quiet):
     [
         ({"frame": 300}, "frame 300"),
         ({"polygon": [[900, 900], [950, 900], [950, 950]]}, "outside"),
-        ({"name": "CORNER"}, "capitals"),
+        ({"name": "CORNER"}, "upper and lower case"),
     ],
 )
 def test_wrong_lassos_are_sentences(take, quiet, row, word):

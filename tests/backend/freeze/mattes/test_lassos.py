@@ -51,7 +51,7 @@ def test_what_cannot_be_is_refused(row):
 
 
 def test_a_file_without_a_lasso_and_a_missing_one_are_refused(tmp_path):
-    with pytest.raises(JobError, match="holds no lasso"):
+    with pytest.raises(JobError, match="contains no lasso"):
         read_lassos(written(tmp_path, {"mattes": []}), 64, 48)
     with pytest.raises(JobError, match="does not exist"):
         read_lassos(tmp_path / "none.json", 64, 48)

@@ -116,7 +116,7 @@ def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(tra
     old, again = read_frozen_exr(frame), quiet()
     freeze_shot(world.shot, FreezeParams(**asked), again)
     assert np.abs(read_frozen_exr(frame).rgba - old.rgba).mean() > 0.1, "rendered again, from the new model"
-    told = ["trained while it was frozen" in "".join(str(e) for e in r.events) for r in (report, again)]
+    told = ["trained during the freeze" in "".join(str(e) for e in r.events) for r in (report, again)]
     assert told == [True, False]
 
 
@@ -381,6 +381,6 @@ def test_pictures_of_the_artist_outlive_a_take_and_a_run_of_that_name(trained, q
     world.shot.take("theirs").mkdir()
     mine.append(world.shot.take("theirs") / "000101.exr")
     mine[-1].write_bytes(b"mine")
-    with pytest.raises(JobError, match="theirs holds numbered pictures that were not made here"):
+    with pytest.raises(JobError, match="theirs contains numbered pictures that Splannequin did not write"):
         freeze_shot(world.shot, FreezeParams(take="theirs", t_star=105), quiet())
     assert [picture.read_bytes() for picture in mine] == [b"mine"] * 3

@@ -95,7 +95,7 @@ def test_parts_of_what_was_not_opened_or_of_another_run_are_refused(own, quiet):
         part(own, "parts2", 104, 104, quiet())
     open_take(own, FreezeParams(take="parts2", **ASK), quiet())
     os.remove(own.run("main") / "developed" / "000104.safetensors")
-    with pytest.raises(JobError, match="is not kept"):
+    with pytest.raises(JobError, match="is missing from the run"):
         part(own, "parts2", 104, 104, quiet())
 
 
@@ -173,7 +173,7 @@ def test_a_part_stops_when_its_take_is_opened_with_something_else(own, quiet):
                 freeze_part(own, other, quiet())
 
     frames = []
-    with pytest.raises(JobError, match="opened with something else"):
+    with pytest.raises(JobError, match="opened with other settings"):
         freeze_part(own, params, Meanwhile())
     facts = finish_take(own, other, quiet())
     assert frames and facts["frames"] == 3

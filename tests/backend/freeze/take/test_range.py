@@ -105,7 +105,7 @@ def test_frames_of_an_earlier_version_are_made_anew_and_that_is_said_once(traine
     before, report = times(folder), quiet()
     freeze_shot(world.shot, ask, report)
     assert all(before[n] != t for n, t in times(folder).items())
-    assert [event for event in report.events if "made by an earlier version" in str(event)]
+    assert [event for event in report.events if "written by an earlier version" in str(event)]
     before, report = times(folder), quiet()
     freeze_shot(world.shot, ask, report)
     assert times(folder) == before and "earlier version" not in str(report.events)

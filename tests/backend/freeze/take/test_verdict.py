@@ -49,16 +49,16 @@ def test_a_guess_at_the_end_is_told_with_frames_place_and_what_to_do():
     assert verdict.lines()[1:] == [
         "Mostly a guess in frames 31 to 40, lower left.",
         "Try a t* nearer to frame 35.",
-        "Or deliver frames 1 to 30.",
+        "Or deliver only frames 1 to 30.",
     ]
     assert unsure(verdict, FRAMES) == set(range(31, 41))
     run = Verdict("fair", ["It does not hold in frame 40."], instants=[5, 28])
     advised = judge_take(facts(lost=range(31, 41)), run)
     assert advised is not None and "Try a t* nearer to frame 28." in advised.advice, "within what the run recommends"
     keyed = judge_take(facts(lost=range(31, 41), t_star_per_frame={"1": 8.0}))
-    assert keyed is not None and keyed.advice == ["Or deliver frames 1 to 30."]
+    assert keyed is not None and keyed.advice == ["Or deliver only frames 1 to 30."]
     own = judge_take(facts(lost=range(31, 41), camera_path="a.json"))
-    assert own is not None and own.advice == ["Keep the camera nearer to the clip's own path there."]
+    assert own is not None and own.advice == ["Keep the camera closer to the clip's own path there."]
 
 
 def test_a_place_that_is_a_guess_all_along_may_be_one_that_does_not_move():
@@ -81,14 +81,14 @@ def test_a_take_of_splats_alone_says_so_and_one_of_before_says_nothing():
 def test_a_take_is_no_better_than_its_run():
     walker = "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 20, middle."
     place = {"first": 10, "last": 20, "region": "middle"}
-    run = Verdict("fair", ["It shows all of the clip.", walker], [place], ["Paint who walks."])
+    run = Verdict("fair", ["It matches the whole clip.", walker], [place], ["Paint walking people."])
     verdict = judge_take(facts(), run)
     assert verdict is not None
-    assert verdict.lines() == ["Fair. 98 % of the picture is plate, 2 % is a guess.", walker, "Paint who walks."]
+    assert verdict.lines() == ["Fair. 98 % of the picture is plate, 2 % is a guess.", walker, "Paint walking people."]
     assert unsure(verdict, FRAMES) == set(range(10, 21))
-    poor = judge_take(facts(), Verdict("poor", ["It does not show the clip."], [], ["Look at its previews."]))
+    poor = judge_take(facts(), Verdict("poor", ["It does not match the clip."], [], ["Check its previews."]))
     assert poor is not None and poor.word == "poor"
-    good = Verdict("good", ["It shows all of the clip.", "What moves sways by up to 7 of 640 pixels."])
+    good = Verdict("good", ["It matches the whole clip.", "Moving parts sway by up to 7 of 640 pixels."])
     assert judge_take(facts(), good) == judge_take(facts())
     summary = verdict_lines({"verdict": vars(run)}, {"verdict": vars(verdict)})
     assert summary.count(walker) == 1, "the summary of both says it once"
