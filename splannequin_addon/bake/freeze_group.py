@@ -29,7 +29,7 @@ def switch_warp(node: bpy.types.CompositorNodeGroup, wanted: bool, possible: boo
         text = "1: the plate that you lead in, frozen by the take's warp; 0: the take's own frames"
         _factor(compat.new_socket(group, name, "INPUT", "NodeSocketFloat", text), 1.0)
         set_value(node.inputs[name], 1.0)
-        return ["What is led into the group is frozen by the take's warp, with its own values."]
+        return ["The image that is linked to the group is frozen by the take's warp and keeps its pixel values."]
     if sockets and not (wanted and possible):
         present(group.interface).remove(sockets[0])
         why = "The take has no warp: its own frames are shown." if wanted else "The take's own frames are shown again."
@@ -48,10 +48,10 @@ def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
     """A sentence for each setting of our node whose layers the take lacks."""
     inside, remarks = present(node.node_tree).nodes, list[str]()
     if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
-        remarks.append("The take has no grain to add: freeze it again.")
+        remarks.append("The take has no grain to add. Freeze it again.")
     frozen = inside[FROZEN].outputs
     if (value_of(node.inputs["Splat"]) or value_of(node.inputs[INVENTED])) and "Plate" not in frozen:
-        remarks.append("The take does not tell plate from splats: it was frozen without detail.")
+        remarks.append("The take cannot separate plate from splats, because it was frozen without detail.")
     return remarks
 
 
@@ -193,7 +193,7 @@ def give_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[s
             if name not in outputs:
                 compat.new_socket(group, name, "OUTPUT", layer.socket, layer.tip)
         elif name in outputs and node.outputs[name].is_linked:
-            remarks.append(f"The take has no {name}, which your compositor uses: freeze it again with Passes.")
+            remarks.append(f"The take has no {name}, but your compositor uses it. Freeze again with Passes.")
         elif name in outputs:
             present(group.interface).remove(outputs[name])
     return remarks

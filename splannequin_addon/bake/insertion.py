@@ -58,13 +58,13 @@ def _need_warp(shot: Path, take: Take) -> None:
     name = take.folder.name
     if inventory.read(shot).takes.get(name, {}).get("camera_path"):
         raise contract.JobError(
-            f"The take {name!r} is seen from a camera of your own: its warp looks into other frames of the plate.",
+            f"The take {name!r} was frozen from your own camera, so its warp needs other frames of the plate.",
             "Use its frozen frames, or freeze a take on the clip's own camera.",
             contract.ExitCode.BAKE,
         )
     if not any(take.plate_size):
         raise contract.JobError(
-            f"The take {name!r} has no warp: it was frozen without detail.",
+            f"The take {name!r} has no warp, because it was frozen without detail.",
             "Freeze it again with detail.",
             contract.ExitCode.BAKE,
         )
@@ -76,7 +76,7 @@ def _sources(scene: bpy.types.Scene, shot: Path, take: str) -> tuple[Take, Path 
         frozen = take_files.take_of(contract.ShotFolder(shot).takes / take, scene_objects.depth_scale(scene, shot))
     except FileNotFoundError as error:
         raise contract.JobError(
-            f"The take {take!r} of {shot.name} holds no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
+            f"The take {take!r} of {shot.name} has no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
         ) from error
     plate = contract.ShotFolder(shot).plate(frozen.first)
     return frozen, plate if plate.is_file() else None
@@ -197,7 +197,7 @@ def _turns(scene_uid: int, shot: Path, take: str, only: int) -> Iterator[None]:
             changes += rendering.choose_output(scene, shot, take)  # now, as part of the same undo step
             seen = scene.session_uid
         else:
-            changes.append(f"{scene.name} is in no window: it was not rendered.")
+            changes.append(f"{scene.name} is not open in any window, so it was not rendered.")
         return changes
 
     job_timer.change(job_timer.watch_of(shot), "bake", put_in, only)

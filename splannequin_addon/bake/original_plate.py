@@ -111,8 +111,8 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
     if footage.map is not None:
         st = sequences.load_numbers(footage.map, _map_name(take))
     width, height = footage.size
-    without = ", without its lens by the take's ST map" if st is not None else ""
-    remarks = [f"The plate is {footage.file.name} itself, {width} x {height}{without}."]
+    without = ", undistorted by the take's ST map" if st is not None else ""
+    remarks = [f"The footage {footage.file.name} is used as the plate, {width} x {height}{without}."]
     return Plate(image, st, remarks, footage.size, footage.shift)
 
 

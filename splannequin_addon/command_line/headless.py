@@ -450,7 +450,7 @@ def _shot(args: argparse.Namespace) -> Path:
     """The shot folder that a command names. Raises JobError if it does not exist."""
     shot = Path(args.shot).absolute()
     if not inventory.read(shot).info:
-        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+        raise contract.JobError(f"{shot} is not a shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
     return shot
 
 

@@ -130,7 +130,7 @@ class Session:
             while (message := contract.read_message(answers)) is not None:
                 self._take_in(*message)
         except (OSError, ValueError, KeyError, TypeError) as error:
-            self._fail(f"The live session broke: {error}.", f"Start it again. Its log is {log}.")
+            self._fail(f"The live session stopped unexpectedly: {error}.", f"Start it again. Its log is {log}.")
         process.stdout.close()
         code = process.wait()
         if not self._closed and self.failure is None:

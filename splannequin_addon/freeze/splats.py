@@ -115,7 +115,7 @@ def reading(path: Path) -> Generator[job_timer.Progress, None, dict[str, np.ndar
             wanted = min(CHUNK, count - first)
             rows = np.frombuffer(handle.read(wanted * layout.itemsize), dtype=np.uint8)
             if len(rows) < wanted * layout.itemsize:
-                raise contract.UserError(f"{path} is cut short: freeze again.")
+                raise contract.UserError(f"{path} is incomplete. Freeze again.")
             vertices = rows.view(layout)
             parts.append({name: vertices[name].astype(np.float32) for name in _NEEDED})
             done = first + wanted

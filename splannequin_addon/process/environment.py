@@ -134,7 +134,7 @@ def _why(setup: SetUp, code: int) -> str:
         error = str(contract.read_json(setup.summary).get("error", ""))
     except (OSError, ValueError):
         error = ""
-    return error or f"The set-up ended with exit code {code}: {' '.join(setup.said[-1:])}"
+    return error or f"The set-up failed with exit code {code}: {' '.join(setup.said[-1:])}"
 
 
 def cancel(setup: SetUp) -> None:

@@ -185,7 +185,7 @@ class _Aligns(OperatorBase):
         if event.type == "MOUSEMOVE" or view is None:
             return {"PASS_THROUGH"}
         if under < 0:
-            self.report({"INFO"}, "No point of the solve is there")
+            self.report({"INFO"}, "There is no point of the solve at this position")
             return {"RUNNING_MODAL"}
         if under not in picked.picked:
             picked.picked.append(under)
@@ -220,7 +220,7 @@ class _Aligns(OperatorBase):
 
 _SELECTED = BoolProperty(
     name="Selected Objects",
-    description="Take the places of the selected objects instead of clicks",
+    description="Use the locations of the selected objects instead of clicked points",
     default=False,
     options={"SKIP_SAVE", "HIDDEN"},
 )
@@ -229,14 +229,15 @@ _SELECTED = BoolProperty(
 def _places_property(count: int) -> list[float]:
     return FloatVectorProperty(
         name="Points",
-        description="Places of the points in the scene, one after the other",
+        description="Coordinates of the points in the scene, one after the other",
         size=3 * count,
         options={"SKIP_SAVE", "HIDDEN"},
     )
 
 
 class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
-    """Click three points of the floor: the solve is turned and moved until they lie at height 0, the camera above"""
+    """Click three points on the floor. The solve is rotated and moved so that they lie at height 0, with the camera
+    above"""
 
     bl_idname = "splannequin.align_floor"
     bl_label = "Floor from Three Points"
@@ -253,7 +254,7 @@ class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
-    """Click a point: the solve is moved until it lies at the scene's origin"""
+    """Click a point. The solve is moved so that the point lies at the scene's origin"""
 
     bl_idname = "splannequin.align_origin"
     bl_label = "Set Origin"
@@ -270,7 +271,7 @@ class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
-    """Click two points and say how far apart they are: the solve is scaled about the scene's origin until it is so"""
+    """Click two points and enter their distance. The solve is scaled about the scene's origin to match it"""
 
     bl_idname = "splannequin.align_scale"
     bl_label = "Set Scale"
@@ -282,7 +283,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
     selected = _SELECTED
     distance = FloatProperty(
         name="Distance",
-        description="How far apart the two points are",
+        description="Distance between the two points",
         default=1.0,
         min=1e-6,
         soft_max=1000.0,

@@ -144,7 +144,7 @@ def read(scene: bpy.types.Scene, file: Path, size: tuple[int, int]) -> dict[str,
     _import(file)
     cameras = sorted((o for o in scene.objects if o.type == "CAMERA"), key=lambda o: o.name)
     if not cameras:
-        raise contract.JobError(f"{file.name} holds no camera.", "Choose another file.", contract.ExitCode.SOLVE)
+        raise contract.JobError(f"{file.name} contains no camera.", "Choose another file.", contract.ExitCode.SOLVE)
     for camera in [c for c in cameras if camera_of(c).type == "PERSP"]:
         data = camera_of(camera)
         if data.sensor_fit == "AUTO":  # files store the film back, whose width is the images' width
@@ -193,7 +193,7 @@ def _choice(file: Path, camera: bpy.types.Object, count: int) -> list[tuple[str,
         return []
     return [
         (
-            f"{file.name} holds {count} cameras: {camera.name} was taken, the first that moves.",
+            f"{file.name} contains {count} cameras. {camera.name} was used, the first that moves.",
             "For another one import the file, and choose Scene Camera.",
         )
     ]
@@ -210,8 +210,9 @@ def _film_back(
     film = f"{data.sensor_width:.4g} x {data.sensor_height:.4g} mm"
     return [
         (
-            f"The film back of {camera.name} in {file.name} is {film}, another shape than the clip's frames.",
-            "Its width was taken for theirs.",
+            f"The film back of {camera.name} in {file.name} is {film}, which is a different aspect ratio than the "
+            "clip's frames.",
+            "The width of the film back was used.",
         )
     ]
 

@@ -142,7 +142,7 @@ def test_no_camera_that_fits_is_said_and_nothing_is_changed(addon, contract, sol
         addon("bake.insertion").combine_cg(solved, shot)
     assert len(addon("compat").compositor_tree(solved).nodes) == nodes and not solved.render.film_transparent
     contract.ShotFolder(shot).camera_path("mine").unlink()
-    with pytest.raises(contract.JobError, match="is not known any more"):
+    with pytest.raises(contract.JobError, match="is no longer known"):
         addon("bake.insertion").combine_cg(solved, shot)
 
 

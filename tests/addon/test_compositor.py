@@ -106,7 +106,7 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
     said = compositor.insert(scene, take, plate)
     tree = compat.compositor_tree(scene)
     assert compat.compositor_enabled(scene)
-    assert "minimal one was made" in said[0]
+    assert "minimal one was created" in said[0]
     assert sorted(
         n.bl_idname for n in tree.nodes if "Output" not in n.bl_idname and "Composite" not in n.bl_idname[-9:]
     ) == [
@@ -184,7 +184,7 @@ def test_group_offers_what_a_compositor_needs(addon, scene, take, contract):
 
 def test_take_without_frames_is_refused_in_words(addon, scene, shot, contract):
     (shot / "takes" / "empty").mkdir()
-    with pytest.raises(contract.JobError, match=r"'empty' .* holds no frozen frames"):
+    with pytest.raises(contract.JobError, match=r"'empty' .* has no frozen frames"):
         addon("bake.insertion").insert(scene, shot, "empty")
 
 

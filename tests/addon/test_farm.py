@@ -55,7 +55,7 @@ def test_the_button_says_what_is_wrong(scene, imported, tmp_path, contract):
     scene.splannequin.shot_path = str(imported)
     with pytest.raises(RuntimeError, match="t\\* is frame 900"):
         bpy.ops.splannequin.export_for_farm(directory=str(tmp_path / "job"), instants="900")
-    with pytest.raises(RuntimeError, match="No folder was given"):
+    with pytest.raises(RuntimeError, match="No folder is chosen"):
         bpy.ops.splannequin.export_for_farm()
 
 

@@ -129,9 +129,9 @@ def test_camera_points_and_plate_are_in_the_baked_file(run, shot, tmp_path):
     [
         ((), 2, "required"),
         (("bake",), 2, "--shot"),
-        (("bake", "--shot", "nowhere", "--output", "out"), 2, "is no shot folder"),
-        (("status", "nowhere"), 2, "is no shot folder"),
-        (("solve", "nowhere"), 2, "is no shot folder"),
+        (("bake", "--shot", "nowhere", "--output", "out"), 2, "is not a shot folder"),
+        (("status", "nowhere"), 2, "is not a shot folder"),
+        (("solve", "nowhere"), 2, "is not a shot folder"),
         (("freeze", "no-such-clip.mp4", "--output", "out"), 3, "no-such-clip.mp4"),
         (("freeze", "clip.mp4", "--preset", "best"), 2, "invalid choice"),
     ],

@@ -300,7 +300,7 @@ def test_a_render_that_tells_no_end_is_over(addon, supervisor, watch, shot, smal
     assert watch.running() == "bake", "the job of a render may be about to begin"
     supervisor.tick()
     assert watch.running() is None and not supervisor._meanwhile
-    assert "wrote no picture for frame 1" in watch.failures["bake"][0]
+    assert "wrote no image for frame 1" in watch.failures["bake"][0]
     assert scene.render.filepath.endswith("f_####")
 
 
@@ -413,7 +413,7 @@ def test_a_solve_that_is_stopped_after_its_cameras_are_known_leaves_them(addon, 
     tell("done", state, state=state, result=None)
     assert watch.running() is None and addon("solve.cameras").find(scene, shot, "CAMERA") is not None
     said = addon("process.steps").STEPS["solve"].view(scene, watch.state).state
-    assert any("What moves is not found yet" in line for line in said)
+    assert any("What moves is not known yet" in line for line in said)
     (shot / "solve" / "motion" / "motion.json").write_text("{}")
     addon("process.job_timer").refresh(watch)
     said = addon("process.steps").STEPS["solve"].view(scene, watch.state).state

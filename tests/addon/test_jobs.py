@@ -93,7 +93,7 @@ def test_a_killed_child_leaves_a_status_that_says_so(addon, contract, start_impo
     while jobs.poll(job, 0.5) == [] and not job.ended:
         time.sleep(0.02)
     os.kill(job.process.pid, signal.SIGKILL)
-    with pytest.raises(contract.JobError, match="stopped without a word"):
+    with pytest.raises(contract.JobError, match="stopped unexpectedly"):
         jobs.wait(job)
     told = json.loads((job.folder / "status.json").read_text())
     assert told["state"] == "failed" and "memory" in told["hint"]
@@ -255,7 +255,7 @@ def test_cancel_ends_no_process_on_a_files_word(addon, contract, empty_shot, sle
     jobs, innocent = addon("process.jobs"), sleeper(*words)
     for host in ("", contract.computer_name()):
         job = believed_running(jobs, contract, empty_shot, innocent.pid, contract.process_start(innocent.pid), host)
-        with pytest.raises(contract.JobError, match="cannot be told from others"):
+        with pytest.raises(contract.JobError, match="could not be identified"):
             jobs.cancel(job)
         assert innocent.poll() is None
 

@@ -127,12 +127,12 @@ def test_where_nothing_fits_a_sentence_says_so_and_the_scene_stays_as_it_was(roo
     told = blender(tmp_path / "config.ocio", root, shot, tmp_path)
     for step in ("first", "again"):
         assert told[step]["error"] == (
-            "The colour configuration that Blender was started with (OCIO) has no colour space for sRGB. "
-            "Start Blender without it, or add one to it."
+            "Blender's OCIO colour configuration has no colour space for sRGB. "
+            "Start Blender without this configuration, or add the colour space to it."
         )
         assert told[step]["changed"] == {}, f"{step}: a build that failed left something behind"
     assert told["without a plate"]["changed"]["made"] == [[], ["my shot é"]]
-    assert "no view that leaves colours alone" in told["freeze"]["error"] and told["freeze"]["changed"] == {}
+    assert "no view that keeps colours unchanged" in told["freeze"]["error"] and told["freeze"]["changed"] == {}
     assert "no colour space for scene-linear Rec.709" in told["as they come"]["error"]
     assert told["as they come"]["changed"] == {}
 

@@ -235,4 +235,4 @@ def test_the_command_line_writes_maps_of_any_width(addon, lens_shot, tmp_path, c
     assert headless.main(["stmaps", str(lens_shot), "--width", "7"]) == 2
     assert "cannot be 7 pixels wide" in capsys.readouterr().err
     assert headless.main(["stmaps", str(tmp_path)]) == 2
-    assert "no shot folder" in capsys.readouterr().err
+    assert "not a shot folder" in capsys.readouterr().err

@@ -71,7 +71,7 @@ def test_no_backend_writes_nothing(addon, scene, clip, tmp_path, monkeypatch):
 
 def test_a_folder_of_no_shot_is_refused(scene, tmp_path):
     scene.splannequin.shot_path = str(tmp_path)
-    with pytest.raises(RuntimeError, match="is no shot folder"):
+    with pytest.raises(RuntimeError, match="is not a shot folder"):
         bpy.ops.splannequin.solve_camera()
 
 
@@ -205,7 +205,7 @@ def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
     shown = {name: step.view(with_shot, state) for name, step in steps.items()}
     assert shown["import"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
     assert shown["solve"].state == ["A good solve."] and "load it" in shown["solve"].advice
-    assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % may move"]
+    assert shown["train"].state == ["Run main: 24.0 dB on held-out frames", "12,345 Gaussians, 5.0 % may move"]
     assert shown["freeze"].state == ["Time stands still at frame 6", "Take freeze: 3 frames, 16 x 12"]
     assert not shown["bake"].done and shown["bake"].ready
 
@@ -257,8 +257,8 @@ def test_broken_points_are_told_in_a_sentence(addon, scene, shot):
         points.write_bytes(data)
         with pytest.raises(RuntimeError) as told:
             bpy.ops.splannequin.load_camera()
-        assert str(told.value).strip() == f"Error: {points} is damaged: solve again."
-    german = addon("translations").translate(f"{points} is damaged: solve again.", "de_DE")
+        assert str(told.value).strip() == f"Error: {points} is damaged. Solve again."
+    german = addon("translations").translate(f"{points} is damaged. Solve again.", "de_DE")
     assert german == f"{points} ist beschädigt: die Kamera neu lösen."
     points.write_bytes(whole)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
@@ -328,7 +328,7 @@ def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_wi
     assert not replaces(a_few), "the same clip again"
     props.clip = str(tmp_path / "B" / "shot.mp4")
     told = replaces(a_few)
-    assert told.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}: its frames")
+    assert told.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}. Its frames")
     assert addon("translations").translate(told, "de_DE").startswith("own.splannequin ist der Shot von ")
     props.clip = ""
     assert not replaces(a_few), "its own clip is taken"
