@@ -154,7 +154,7 @@ def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bp
     layers = _layers_of(image, take)
     missing = [n for n in names if n not in layers]
     if missing:
-        raise contract.UserError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+        raise contract.UserError(f"The frames in {take.folder} have no layer {missing[0]!r}. Freeze the take again.")
     return image
 
 

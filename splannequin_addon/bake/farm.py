@@ -91,7 +91,7 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
             question = farm_job.begin(words, requests_of(scene, shot))
             if bpy.app.background:
                 for line in farm_job.written(question):
-                    self.report({"INFO"}, line)
+                    self.report({"INFO"}, tr(line))
                 return {"FINISHED"}
         except (contract.JobError, OSError, ValueError) as error:
             sentence = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()

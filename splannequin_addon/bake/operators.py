@@ -105,7 +105,7 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
         progress.began(folder, run)
         try:
             if "CANCELLED" in bpy.ops.render.render(how, animation=True, scene=scene.name) and not run.done:
-                run.refused(RuntimeError("it was cancelled"))
+                run.refused(RuntimeError("the render was cancelled"))
         except RuntimeError as error:
             run.refused(error)
         if how == "EXEC_DEFAULT" or run.error is not None:

@@ -102,7 +102,7 @@ class Bake(Step):
     def in_use(self, shot: Path, folder: Path) -> str:
         """The reason why a take cannot be deleted: this file shows its frames. Empty if it does not."""
         if shown(folder):
-            return "The compositor shows this take: bake another one, or remove the shot from the scene, first"
+            return "The compositor shows this take. Bake another take or remove the shot from the scene first."
         return ""
 
     def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:

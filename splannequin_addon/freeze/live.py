@@ -136,7 +136,7 @@ class Session:
         if not self._closed and self.failure is None:
             words = last_line(log)
             log_line = f" Last line of its log: {words}" if words else ""
-            self._fail(f"The live session ended without a word (exit code {code}).{log_line}", "Start it again.")
+            self._fail(f"The live session ended unexpectedly (exit code {code}).{log_line}", "Start it again.")
 
     def _take_in(self, header: dict[str, Any], body: bytes) -> None:
         if header["kind"] == "ready":

@@ -51,7 +51,7 @@ def clip_path(shot: Path) -> ClipPath:
     """The solved camera of a shot. Raises FileNotFoundError or ValueError, which name the file."""
     solved = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
     if not solved.frames:
-        raise contract.UserError(f"{shot} has no solved camera: solve again")
+        raise contract.UserError(f"{shot} has no solved camera. Solve again.")
     numbers = np.array([f.frame for f in solved.frames], dtype=np.float64)
     poses = moves.filled(numbers, axes.poses(solved))
     lenses = moves.between(numbers[0] + np.arange(len(poses), dtype=np.float64), numbers, cameras.lenses_of(solved))

@@ -109,7 +109,7 @@ def reading(path: Path) -> Generator[job_timer.Progress, None, dict[str, np.ndar
         layout = np.dtype(fields)
         missing = [name for name in _NEEDED if name not in (layout.names or ())]
         if missing:
-            raise contract.UserError(f"{path}: not a 3D Gaussian PLY, the vertices have no {', '.join(missing[:4])}")
+            raise contract.UserError(f"{path} is not a 3D Gaussian PLY: its vertices have no {', '.join(missing[:4])}")
         parts: list[dict[str, np.ndarray]] = []
         for first in range(0, max(count, 1), CHUNK):
             wanted = min(CHUNK, count - first)

@@ -120,7 +120,7 @@ class Freeze(Step):
         """The reason why a run cannot be deleted: it is being scrubbed. Empty if it is not."""
         session = viewport.session()
         if session is not None and folder == contract.ShotFolder(shot).runs / session.run and session.shot == shot:
-            return "You are scrubbing through this run: stop scrubbing first"
+            return "You are scrubbing through this run. Stop scrubbing first."
         return ""
 
 

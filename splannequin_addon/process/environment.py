@@ -189,7 +189,7 @@ def remove(folder: Path, wait: bool = False) -> bool:
     if not environment.is_dir():
         return False
     if not (environment / contract.SETUP_NOTES).is_dir():
-        raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
+        raise ValueError(f"{environment} was not created by Splannequin")
     _nobody_in(environment)
     # Rename first, so that no partly deleted folder counts as an environment after an interruption.
     renamed = folder / f"{_REMOVED}{uuid.uuid4().hex[:8]}"

@@ -193,7 +193,7 @@ def is_alive(job: Job, status: contract.Status | None) -> bool:
 def refuse_second_writer(shot: Path) -> None:
     """Raises JobError if a job writes into the shot or is about to.
 
-    For the holder of the lock, the message names the job, its start and its host.
+    The message names the job, its start and its host, if they are known.
     """
     try:
         writer = contract.read_writer(shot)
@@ -204,6 +204,11 @@ def refuse_second_writer(shot: Path) -> None:
     for job in latest(shot).values():
         is_local = job.status is None or job.status.host in ("", contract.computer_name())  # others hold the lock
         if is_local and not job.ended and is_alive(job, job.status):
+            if job.status is not None:
+                status = job.status
+                host, job_name = contract.computer_name(), job.folder.name
+                writer = contract.Writer(host, status.pid, status.process_started, job.kind, job_name, status.started)
+                raise contract.busy(shot, writer)
             raise contract.JobError(
                 f"A step of {shot.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
             )

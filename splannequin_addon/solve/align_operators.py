@@ -91,7 +91,7 @@ class _Aligns(OperatorBase):
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         """Tooltip of the button for selected objects."""
-        return "The same from the places of the selected objects, such as empties" if properties.selected else ""
+        return tr("Use the locations of selected objects, such as empties") if properties.selected else ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Starts the clicking, unless `places` is set or selected objects are used."""
@@ -111,11 +111,11 @@ class _Aligns(OperatorBase):
             notes = scale.move(scene, shot, self.change(scene, shot, self._places(context, shot)))
         except (contract.JobError, OSError, ValueError) as error:
             message = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
-            self.report({"ERROR"}, message)
+            self.report({"ERROR"}, tr(message))
             return {"CANCELLED"}
         job_timer.watch_of(shot).notes["solve"] = notes
         for note in notes:
-            self.report({"INFO"}, note)
+            self.report({"INFO"}, tr(note))
         return {"FINISHED"}
 
     def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
@@ -142,7 +142,7 @@ class _Aligns(OperatorBase):
         cloud = cameras.find(scene, shot, "MESH")
         xyz = points.coloured(mesh_of(cloud))[0] if cloud is not None else np.zeros((0, 3), np.float32)
         if bpy.app.background or not len(xyz):
-            message = "There are no points to click: select objects that stand where they should be"
+            message = "There are no points to click. Select objects at the positions of the points"
             self.report({"ERROR"}, message)
             return {"CANCELLED"}
         stop()
@@ -214,7 +214,8 @@ class _Aligns(OperatorBase):
         if _picking is None:
             return
         done = f"{len(_picking.picked)} of {_picking.wanted}"
-        context.workspace.status_text_set(f"{self.asked}: {done}.  Backspace: one back.  Esc: cancel")
+        text = tr(f"{self.asked}: {done}.  Backspace: remove the last point.  Esc: cancel")
+        context.workspace.status_text_set(text)
         _redraw(context.window)
 
 
@@ -243,7 +244,7 @@ class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
     bl_label = "Floor from Three Points"
     bl_options = {"REGISTER", "UNDO"}
     count = 3
-    asked = "Click three points of the floor"
+    asked = "Click three points on the floor"
 
     places = _places_property(3)
     selected = _SELECTED
@@ -260,7 +261,7 @@ class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
     bl_label = "Set Origin"
     bl_options = {"REGISTER", "UNDO"}
     count = 1
-    asked = "Click the point that is to be the origin"
+    asked = "Click the point for the origin"
 
     places = _places_property(1)
     selected = _SELECTED
@@ -277,7 +278,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
     bl_label = "Set Scale"
     bl_options = {"REGISTER", "UNDO"}
     count = 2
-    asked = "Click two points whose distance you know"
+    asked = "Click two points with a known distance"
 
     places = _places_property(2)
     selected = _SELECTED

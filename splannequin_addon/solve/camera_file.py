@@ -112,7 +112,7 @@ def main(words: str) -> int:
         print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
         return error.exit_code
     except OSError as error:
-        known = inventory.unwritable(Path(wanted["shot"]), error, "Is the disk full?")
+        known = inventory.unwritable(Path(wanted["shot"]), error, "Make sure that the disk is not full.")
         print(f"Error: {known.message} {known.hint}".rstrip(), file=sys.stderr)
         return known.exit_code
     return contract.ExitCode.OK
@@ -239,7 +239,9 @@ def _refused(file: Path, said: str) -> contract.JobError:
     """The error for a file that an importer refused, with the importer's message unless it is a traceback."""
     first = next((line for line in said.splitlines() if line.strip()), "").removeprefix("Error: ").strip().rstrip(".")
     why = (
-        contract.printable(first, 200) if first and "Traceback" not in first else "it is damaged, or of another format"
+        contract.printable(first, 200)
+        if first and "Traceback" not in first
+        else "it is damaged or has an unsupported format"
     )
     return contract.JobError(
         f"Blender could not read {file.name}: {why}.",

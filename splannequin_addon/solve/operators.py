@@ -76,14 +76,14 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
             placement.write(scene_in(context), shot)
             question = exchange.begin_export(words)
             if bpy.app.background:
-                self.report({"INFO"}, exchange.exported(question, folder))
+                self.report({"INFO"}, tr(exchange.exported(question, folder)))
                 return {"FINISHED"}
         except contract.JobError as error:
-            self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}
         except OSError as error:
-            refusal = inventory.unwritable(shot, error, "Is the disk full, or the shot on a disk that is read only?")
-            self.report({"ERROR"}, f"{refusal.message} {refusal.hint}".strip())
+            refusal = inventory.unwritable(shot, error, "Make sure that the disk is not full or read-only.")
+            self.report({"ERROR"}, tr(f"{refusal.message} {refusal.hint}".strip()))
             return {"CANCELLED"}
         job_timer.watch_of(shot).failures.pop("solve", None)
         job_timer.when_answered(question, lambda: tell(shot, lambda: [exchange.exported(question, folder)]))
@@ -160,7 +160,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         try:
             question = stmaps.begin(folder, self.width)
         except contract.JobError as error:
-            self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}
         watch = job_timer.watch_of(folder)
         watch.failures.pop("solve", None)
@@ -171,10 +171,10 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         question.wait()
         tell(folder, lambda: stmaps.sentences(stmaps.answer(question)))
         if "solve" in watch.failures:
-            self.report({"ERROR"}, watch.failures["solve"][0])
+            self.report({"ERROR"}, tr(watch.failures["solve"][0]))
             return {"CANCELLED"}
         for line in watch.notes["solve"]:
-            self.report({"INFO"}, line)
+            self.report({"INFO"}, tr(line))
         return {"FINISHED"}
 
 

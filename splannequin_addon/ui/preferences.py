@@ -202,7 +202,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
             _setup.process.wait()
         environment.poll(_setup)
         if _setup.failure:
-            self.report({"ERROR"}, _setup.failure)
+            self.report({"ERROR"}, tr(_setup.failure))
             return {"CANCELLED"}
         return {"FINISHED"}
 

@@ -99,7 +99,7 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
             self.report({"INFO"}, "The shot's data is kept, because another shot in the list has the same folder")
         elif self.things and folder is not None:
             for note in begin.remove_all(scene, folder):
-                self.report({"INFO"}, note)
+                self.report({"INFO"}, tr(note))
         selection.remove(scene, settings_of(scene).loaded_shot)
         return {"FINISHED"}
 

@@ -143,7 +143,7 @@ def test_a_bake_comes_into_the_scene_where_it_was_asked_for_alone(addon, contrac
     watch.work = None
     ended_bake(addon, contract, supervisor, watch, shot, "A lookdev")
     until_it_renders(supervisor, watch)
-    assert baked(addon) == ["A lookdev"] and "A lookdev is in no window" in watch.notes["bake"][-1]
+    assert baked(addon) == ["A lookdev"] and "A lookdev is not open in any window" in watch.notes["bake"][-1]
 
 
 def test_a_bake_of_a_scene_that_is_gone_comes_into_those_of_the_shot(addon, contract, supervisor, watch, shot):

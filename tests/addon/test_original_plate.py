@@ -193,17 +193,20 @@ def test_a_turned_video_is_the_plate_where_blender_turns_it_and_working_frames_e
     if code != 3:
         assert (list(image.size) == size) == turns, "what this Blender does is what is known of it"
     itself = any(line.startswith("The footage turned.mp4 is used as the plate") for line in said)
-    assert itself == turns and turns != any("it is turned by its header" in line for line in said)
+    assert itself == turns and turns != any("its header rotates the image" in line for line in said)
 
 
 @pytest.mark.parametrize(
     "told, why",
     [
         ({"unlike": "its pixels are not square"}, "000005.exr: its pixels are not square"),
-        ({"file": "/nowhere/a.0001.exr", "beside": ""}, "a.0001.exr is not there any more"),
+        ({"file": "/nowhere/a.0001.exr", "beside": ""}, "a.0001.exr no longer exists"),
         ({"size": [64, 48]}, "Blender reads 000005.exr at 56 x 42"),
-        ({"probe": [7.0, 0.3, 0.2], "space": "a log"}, "Blender's colour configuration has no space like a log"),
-        ({"map": "stmap/undistort.exr"}, "the take's ST map is gone"),
+        (
+            {"probe": [7.0, 0.3, 0.2], "space": "a log"},
+            "Blender's colour configuration has no colour space that matches a log",
+        ),
+        ({"map": "stmap/undistort.exr"}, "the take's ST map no longer exists"),
     ],
 )
 def test_working_frames_stand_in_and_a_sentence_says_why(addon, scene, footage, told, why):
@@ -237,7 +240,9 @@ def test_blender_looks_for_the_files_that_the_import_says_it_does(contract, tmp_
 
 def test_footage_moved_together_with_the_shot_is_found(addon, scene, footage):
     shot = footage(file="/nowhere/000005.exr")
-    assert "The footage 000005.exr is used as the plate, 56 x 42." in addon("bake.insertion").insert_freeze(scene, shot, "detail")
+    assert "The footage 000005.exr is used as the plate, 56 x 42." in addon("bake.insertion").insert_freeze(
+        scene, shot, "detail"
+    )
 
 
 def test_a_take_of_before_shows_the_working_frames_as_it_did(addon, scene, shot):

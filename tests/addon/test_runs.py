@@ -49,7 +49,9 @@ def test_the_button_says_what_it_will_do(addon, with_runs, shot):
     props.run_name = "better"
     assert (plan(addon, with_runs).kind, plan(addon, with_runs).button) == ("resume", "Resume")
     props.preset = "final"
-    assert plan(addon, with_runs).button == "Train from Scratch" and "a different preset" in plan(addon, with_runs).words
+    assert (
+        plan(addon, with_runs).button == "Train from Scratch" and "a different preset" in plan(addon, with_runs).words
+    )
     props.run_name = "main"
     assert plan(addon, with_runs).kind == "anew"
     props.preset = "preview"
@@ -75,7 +77,7 @@ def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, sh
     assert addon("train.training").history(state.runs["main"], [(4.0, 21.0)]) == [(3.0, 20.0), (4.0, 21.0)]
     assert plan(addon, with_runs).button == "Continue Training", "the run that is there is of the preset that is chosen"
     props.preset = "final"
-    assert plan(addon, with_runs).kind == "resume" and "as it was" in plan(addon, with_runs).words
+    assert plan(addon, with_runs).kind == "resume" and "does not change" in plan(addon, with_runs).words
     asked = addon("process.steps").STEPS["train"].params(with_runs)
     assert (asked.run, asked.preset, asked.seed, asked.iterations, asked.extend) == ("main", "final", 9, 900, 0)
 
