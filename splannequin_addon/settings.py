@@ -55,7 +55,10 @@ class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, folds.Folds, bpy.types.Pr
         name="Shot", description="Shot that the steps work on", default=0, min=0, options=set(), update=_chosen
     )
     loaded_shot = IntProperty(
-        name="Loaded", description="Shot of the list whose settings are the scene's", default=0, options={"HIDDEN"}
+        name="Loaded",
+        description="Shot in the list whose settings the scene currently has",
+        default=0,
+        options={"HIDDEN"},
     )
     camera_before = PointerProperty(
         name="Previous Camera",

@@ -42,7 +42,9 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
         wrong = cg_camera.difference(scene, frozen.folder, [numbers[0], numbers[-1]]) if numbers else ""
         changes += [wrong] if wrong else []
     if lacking:
-        changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
+        changes.append(
+            f"The take lacks {len(lacking)} frames of the scene's range. The first missing frame is {lacking[0]}."
+        )
     return changes
 
 
@@ -59,7 +61,7 @@ def _need_warp(shot: Path, take: Take) -> None:
     if inventory.read(shot).takes.get(name, {}).get("camera_path"):
         raise contract.JobError(
             f"The take {name!r} was frozen from your own camera, so its warp needs other frames of the plate.",
-            "Use its frozen frames, or freeze a take on the clip's own camera.",
+            "Use the take's frozen frames, or freeze a take from the clip's camera.",
             contract.ExitCode.BAKE,
         )
     if not any(take.plate_size):

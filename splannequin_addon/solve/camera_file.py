@@ -79,7 +79,7 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
         return children.Question(children.start(placed, backend.package_root(), outlives=False, **piped))
     except OSError as error:
         raise contract.JobError(
-            f"No second Blender could be started to read {file.name}: {error}.",
+            f"A second Blender could not be started to read {file.name}: {error}.",
             "Import the file, and choose Scene Camera.",
             contract.ExitCode.ENVIRONMENT,
         ) from error

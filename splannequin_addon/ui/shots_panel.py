@@ -73,7 +73,7 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     things = BoolProperty(
-        name="Remove Its Data from the File",
+        name="Remove Shot Data from File",
         description="Also remove its camera, points, markers and compositor group from the file",
         default=True,
         options={"SKIP_SAVE"},

@@ -85,7 +85,7 @@ def test_footage_that_the_shot_numbers_otherwise_is_shown_at_the_shots_frames(ad
     facts["footage"]["file"] = str(folder / f"moved.{5 - shift:06d}.exr")
     take.write_text(json.dumps(facts))
     said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
-    assert any("itself, 56 x 42." in line for line in said)
+    assert any("is used as the plate, 56 x 42." in line for line in said)
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
     for frame in (5, 6):
         assert np.array_equal(render(scene, tmp_path, frame), made.plate(frame))
