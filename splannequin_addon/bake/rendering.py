@@ -334,7 +334,7 @@ def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
     lost = [n for n, path in _places(scene, wanted, folder).items() if not contract.is_whole_picture(path)]
     if lost:
         raise contract.JobError(
-            f"{folder} lacks {len(lost)} of {len(wanted)} frames. The first missing frame is {lost[0]}.",
+            f"{folder} lacks {len(lost)} of {len(wanted)} frames, the first is {lost[0]}.",
             "Bake the part with the missing frames again.",
             contract.ExitCode.BAKE,
         )

@@ -1185,7 +1185,7 @@ BACKEND: dict[str, str] = {
     "Import a clip first": "Zuerst einen Clip importieren",
     "The .blend file outputs a movie, which cannot be rendered in parts.": "Die .blend-Datei gibt einen Film aus, der nicht in Teilen gerendert werden kann.",
     "Choose an image format for the output.": "Ein Bildformat für die Ausgabe wählen.",
-    "{} lacks {} of {} frames. The first missing frame is {}.": "{} fehlen {} von {} Bildern. Das erste fehlende ist {}.",
+    "{} lacks {} of {} frames, the first is {}.": "{} fehlen {} von {} Bildern, das erste ist {}.",
     "Bake the part with the missing frames again.": "Den Teil mit den fehlenden Bildern neu backen.",
     "Export for Farm": "Für Renderfarm exportieren",
     "Write this shot as an Open Job Description for a render farm: the missing steps, the take in parts, and an estimate of the cost": "Diesen Shot als Open Job Description für eine Renderfarm schreiben: die fehlenden Schritte, den Take in Teilen und eine Schätzung der Kosten",

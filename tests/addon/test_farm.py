@@ -81,7 +81,7 @@ def test_a_bake_in_parts_is_the_bake_at_once(run, shot, tmp_path):
     assert sorted(p.name for p in whole.iterdir()) == ["composited"]
     assert run(*bake, parts, "--part", "frames", "--first", "6", "--last", "7")[0] == 0
     code, _, err = run(*bake, parts, "--part", "file")
-    assert code == 7 and "lacks 1 of 3 frames. The first missing frame is 5" in err
+    assert code == 7 and "lacks 1 of 3 frames, the first is 5" in err
     (parts / "composited" / ".part-killed").mkdir()
     assert run(*bake, parts, "--part", "frames", "--first", "5", "--last", "6")[0] == 0
     assert run(*bake, parts, "--part", "file")[0] == 0
