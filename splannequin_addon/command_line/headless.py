@@ -69,7 +69,7 @@ def main(argv: Sequence[str]) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     except (contract.Cancelled, KeyboardInterrupt):
-        print("Cancelled. Finished work is kept. Run the same command again to continue.", file=sys.stderr)
+        print("Cancelled. Run the same command again to continue: finished work is kept.", file=sys.stderr)
         return ExitCode.CANCELLED
     except contract.JobError as error:
         print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
