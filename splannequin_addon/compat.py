@@ -407,8 +407,8 @@ def colour_space(encoding: str | tuple[float, ...]) -> str:
             names = {"linear": "scene-linear Rec.709", "srgb": "sRGB"}
             what = names[encoding] if isinstance(encoding, str) else "these pictures"
             raise UserError(
-                f"The colour configuration that Blender was started with (OCIO) has no colour space for {what}. "
-                "Start Blender without it, or add one to it."
+                f"Blender's OCIO colour configuration has no colour space for {what}. Start Blender without this "
+                "configuration, or add the colour space to it."
             )
         _spaces[encoding] = name
     return _spaces[encoding]

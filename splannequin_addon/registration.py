@@ -70,7 +70,7 @@ def register() -> None:
     if registered():
         return
     if owner():
-        raise RuntimeError(translations.tr(f"Splannequin is enabled already, as {owner()}: disable that copy first."))
+        raise RuntimeError(translations.tr(f"Splannequin is already enabled as {owner()}. Disable that copy first."))
     _take_tooltips_from_docstrings()
     for step in _STEPS:
         steps.add(step)
@@ -84,7 +84,7 @@ def register() -> None:
             begin()
     except Exception as error:
         _undo(undo)
-        raise RuntimeError(translations.tr(f"Splannequin cannot be enabled, and nothing of it is: {error}")) from error
+        raise RuntimeError(translations.tr(f"Splannequin could not be enabled: {error}")) from error
     finally:
         for cls in holders:
             properties.release(cls)

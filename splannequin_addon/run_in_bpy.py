@@ -37,7 +37,7 @@ def load_package() -> types.ModuleType:
                 sys.modules[parent] = module
     spec = importlib.util.spec_from_file_location(PACKAGE, root / "__init__.py", submodule_search_locations=[str(root)])
     if spec is None or spec.loader is None:
-        raise FileNotFoundError(f"{root} holds no __init__.py: it is not the Splannequin package")
+        raise FileNotFoundError(f"{root} is not the Splannequin package: it has no __init__.py")
     package = importlib.util.module_from_spec(spec)
     sys.modules[PACKAGE] = package
     spec.loader.exec_module(package)

@@ -29,7 +29,7 @@ class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
 
     scene_settings = StringProperty(
         name="Scene Settings",
-        description="Size, rate and range of the scene while this shot was chosen",
+        description="Resolution, frame rate and frame range of the scene while this shot was chosen",
         options={"HIDDEN"},
     )
 
@@ -39,8 +39,9 @@ class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, folds.Folds, bpy.types.Pr
 
     set_up_scene = BoolProperty(
         name="Fit Scene to Clip",
-        description="Set resolution, frame rate and frame range of the scene to the clip's. "
-        "Off: only a new scene is set up, one you have worked in is left alone",
+        description="Set the scene's resolution, frame rate and frame range to the clip's. Off: only a new "
+        "scene is set "
+        "up, an edited scene is not changed",
         default=False,
         options=set(),
     )
@@ -51,26 +52,29 @@ class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, folds.Folds, bpy.types.Pr
         options=set(),
     )
     active_shot = IntProperty(
-        name="Shot", description="The shot that the steps are about", default=0, min=0, options=set(), update=_chosen
+        name="Shot", description="Shot that the steps work on", default=0, min=0, options=set(), update=_chosen
     )
     loaded_shot = IntProperty(
-        name="Loaded", description="Shot of the list whose settings are the scene's", default=0, options={"HIDDEN"}
+        name="Loaded",
+        description="Shot in the list whose settings the scene currently has",
+        default=0,
+        options={"HIDDEN"},
     )
     camera_before = PointerProperty(
-        name="Camera Before",
-        description="Camera of the scene before a shot's was put in its place",
+        name="Previous Camera",
+        description="Camera of the scene before a shot's camera replaced it",
         type=bpy.types.Object,
         options={"HIDDEN"},
     )
     world_before = PointerProperty(
-        name="World Before",
-        description="World of the scene before a shot's light was put in its place",
+        name="Previous World",
+        description="World of the scene before a shot's light replaced it",
         type=bpy.types.World,
         options={"HIDDEN"},
     )
     made = CollectionProperty(
         name="Made",
-        description="What was put into this scene, by shot",
+        description="Data that was added to this scene, by shot",
         type=scene_objects.SPLANNEQUIN_PG_made,
         options=set(),
     )

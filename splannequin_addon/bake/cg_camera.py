@@ -40,16 +40,16 @@ def check(scene: bpy.types.Scene, frames: Sequence[int]) -> bool:
         layer = next((one for one in rendered.view_layers if one.name == node.layer), None)
         if layer is None or not layer.use:
             raise contract.JobError(
-                f"The view layer {node.layer}, which is led into the freeze as CG, is not used for rendering.",
-                "Switch it on in the view layer's properties, or take it out of the compositor.",
+                f"The view layer {node.layer} is linked into the freeze as CG but is not used for rendering.",
+                "Enable it in the view layer's properties, or remove it from the compositor.",
                 contract.ExitCode.BAKE,
             )
         why = difference(rendered, shown[0], frames)
         if why:
             right = matching_camera(rendered, shown[0], frames)
-            hint = "Freeze a take from this camera, or take CG out of the freeze."
+            hint = "Freeze a take from this camera, or unlink CG from the freeze."
             if right is not None:
-                hint = f"Make {right.name} the scene's camera, or take CG out of the freeze."
+                hint = f"Make {right.name} the scene's camera, or unlink CG from the freeze."
             raise contract.JobError(why, hint, contract.ExitCode.BAKE)
     return True
 
@@ -81,8 +81,9 @@ def difference(scene: bpy.types.Scene, take: Path, frames: Sequence[int], camera
                 name = camera or (scene.camera.name if scene.camera is not None else "")
                 pixels = min(away, 9999.0)  # infinite if the camera looks away
                 return (
-                    f"CG would slide: at frame {number} the camera {name} of {scene.name} sees things {pixels:.1f} px "
-                    f"beside where the camera of take {take.name} saw them."
+                    f"CG would slide: at frame {number} the camera {name} of {scene.name} differs by "
+                    f"{pixels:.1f} px from "
+                    f"the camera of take {take.name}."
                 )
     finally:
         if scene.frame_current != before:
@@ -112,11 +113,12 @@ def use_matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int
     if right is None:
         raise contract.JobError(
             why,
-            "No camera of this scene sees the same: bring that camera back, or freeze a take from this one.",
+            "No camera of this scene matches it. Restore the camera of the take, or freeze a take from the "
+            "current camera.",
             contract.ExitCode.BAKE,
         )
     scene.camera = right
-    return [f"{right.name} is the scene's camera now: take {take.name} was frozen from it."]
+    return [f"{right.name} is now the scene's camera, because take {take.name} was frozen from it."]
 
 
 def seen_from(shot: Path, take: str) -> contract.CameraPath:
@@ -130,7 +132,7 @@ def seen_from(shot: Path, take: str) -> contract.CameraPath:
     except (OSError, ValueError):
         pass
     raise contract.JobError(
-        f"The camera that take {take} was frozen from is not known any more.",
+        f"The camera that take {take} was frozen from is no longer known.",
         "Freeze the take again, or solve the shot.",
         contract.ExitCode.BAKE,
     )

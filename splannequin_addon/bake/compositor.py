@@ -78,7 +78,7 @@ def insert(
     if tree is None or not len(tree.nodes):
         tree = compat.new_compositor_tree(scene, "Splannequin Compositing")
         before["made_tree"] = True
-        changes.append("The scene had no compositor tree: a minimal one was made.")
+        changes.append("The scene had no compositor node tree, so a minimal one was created.")
     if not enabled:
         compat.enable_compositor(scene)
         if not before["made_tree"]:
@@ -105,7 +105,7 @@ def _placed(
     if node is None:
         node = freeze_group.new_node(tree, before)
         placing.route_through(tree, node, behind)
-        place = "as the plate: what follows it goes on from there" if behind is not None else "before the output"
+        place = "in place of the plate" if behind is not None else "before the output"
         return node, [f'The node group "{GROUP_NAME}" was inserted {place}.']
     changes: list[str] = []
     if where != "AUTO" and placing.is_behind_plate(node) != (behind is not None):
@@ -154,7 +154,7 @@ def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bp
     layers = _layers_of(image, take)
     missing = [n for n in names if n not in layers]
     if missing:
-        raise contract.UserError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+        raise contract.UserError(f"The frames in {take.folder} have no layer {missing[0]!r}. Freeze the take again.")
     return image
 
 
@@ -181,8 +181,8 @@ def may_combine_cg(scene: bpy.types.Scene) -> bpy.types.CompositorNodeGroup:
         raise contract.JobError("The freeze is not in this compositor.", "Bake first.", contract.ExitCode.BAKE)
     if node.inputs["CG"].is_linked:
         raise contract.JobError(
-            f'Something is led into "CG" of {GROUP_NAME} already.',
-            "Unlink it to have it done here.",
+            f'The input "CG" of {GROUP_NAME} is already linked.',
+            "Unlink it first.",
             contract.ExitCode.BAKE,
         )
     return node
@@ -203,7 +203,10 @@ def combine_cg(scene: bpy.types.Scene) -> list[str]:
     layers.location = (node.location.x - 2 * GAP, node.location.y - 300.0)
     tree.links.new(layers.outputs["Image"], node.inputs["CG"])
     tree.links.new(layers.outputs["Depth"], node.inputs["CG Depth"])
-    return ["The scene's own render was led into the freeze: objects stand among the frozen people by depth."]
+    return [
+        "The scene's render was linked into the freeze. Objects appear in front of or behind the frozen "
+        "people by depth."
+    ]
 
 
 def remove(scene: bpy.types.Scene) -> bool:

@@ -35,8 +35,8 @@ def requests_of(scene: bpy.types.Scene, shot: Path) -> dict[str, Any]:
 
 
 class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
-    """Write this shot as a job for a render farm, as Open Job Description: what it lacks, the take in parts, and what
-    that will cost"""
+    """Write this shot as an Open Job Description for a render farm: the missing steps, the take in parts, and an
+    estimate of the cost"""
 
     bl_idname = "splannequin.export_for_farm"
     bl_label = "Export for Farm"
@@ -49,13 +49,14 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
         name="Folders", description="Show folders", default=True, options={"HIDDEN", "SKIP_SAVE"}
     )
     instants = StringProperty(
-        name="Instants", description="Frames at which time stands still, with commas, a take for each; empty: t*"
+        name="Instants",
+        description="Frames at which time stands still, separated by commas, with one take each; empty: t*",
     )
     frames = IntProperty(
-        name="Frames per Task", description="Frames of the take that one task freezes", default=10, min=1, max=100_000
+        name="Frames per Task", description="Number of frames that one task freezes", default=10, min=1, max=100_000
     )
     bake = BoolProperty(
-        name="Bake", description="Render the take through Blender's compositor on the farm, too", default=False
+        name="Bake", description="Also render the take through Blender's compositor on the farm", default=False
     )
 
     @classmethod
@@ -80,7 +81,7 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
         scene = scene_in(context)
         shot = selection.shot_folder(scene)
         if shot is None or not self.directory:
-            self.report({"ERROR"}, "No folder was given")
+            self.report({"ERROR"}, "No folder is chosen")
             return {"CANCELLED"}
         folder = Path(os.path.abspath(bpy.path.abspath(self.directory)))
         words = contract.FarmWords(
@@ -90,7 +91,7 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
             question = farm_job.begin(words, requests_of(scene, shot))
             if bpy.app.background:
                 for line in farm_job.written(question):
-                    self.report({"INFO"}, line)
+                    self.report({"INFO"}, tr(line))
                 return {"FINISHED"}
         except (contract.JobError, OSError, ValueError) as error:
             sentence = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()

@@ -91,7 +91,7 @@ def fitted(
     coverage = None
     for row, name in enumerate(("", *names) if shown is not None else names):
         node = compat.new_fit_node(group, mode)
-        node.label = f"Fit {name}" if name else "Fit what there is"
+        node.label = f"Fit {name}" if name else "Fit coverage"
         node.location = (-GAP, 150.0 - 170.0 * row)
         group.links.new(sockets[name] if name or shown is None else shown, node.inputs[0])
         if not name:

@@ -26,10 +26,10 @@ def switch_warp(node: bpy.types.CompositorNodeGroup, wanted: bool, possible: boo
     sockets = [i for i in compat.sockets_of(group) if i.in_out == "INPUT" and i.name == name]
     group[_WARPS] = wanted
     if wanted and possible and not sockets:
-        text = "1: the plate that you lead in, frozen by the take's warp; 0: the take's own frames"
+        text = "1: the input image, frozen by the take's warp; 0: the take's frames"
         _factor(compat.new_socket(group, name, "INPUT", "NodeSocketFloat", text), 1.0)
         set_value(node.inputs[name], 1.0)
-        return ["What is led into the group is frozen by the take's warp, with its own values."]
+        return ["The image that is linked to the group is frozen by the take's warp and keeps its pixel values."]
     if sockets and not (wanted and possible):
         present(group.interface).remove(sockets[0])
         why = "The take has no warp: its own frames are shown." if wanted else "The take's own frames are shown again."
@@ -48,10 +48,10 @@ def missing_layers(node: bpy.types.CompositorNodeGroup) -> list[str]:
     """A sentence for each setting of our node whose layers the take lacks."""
     inside, remarks = present(node.node_tree).nodes, list[str]()
     if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
-        remarks.append("The take has no grain to add: freeze it again.")
+        remarks.append("The take has no grain to add. Freeze it again.")
     frozen = inside[FROZEN].outputs
     if (value_of(node.inputs["Splat"]) or value_of(node.inputs[INVENTED])) and "Plate" not in frozen:
-        remarks.append("The take does not tell plate from splats: it was frozen without detail.")
+        remarks.append("The take cannot separate plate from splats, because it was frozen without detail.")
     return remarks
 
 
@@ -123,19 +123,19 @@ def _is_ours(group: bpy.types.NodeTree | None) -> bool:
 
 
 _FACTORS = (
-    ("Mix", 1.0, "0: your stream, 1: the frozen frame"),
-    ("Wipe", 1.0, "The frozen frame shows left of here: 0 is the left edge, 1 the right"),
-    ("Only Supported", 0.0, "1: your stream shows through where the frozen frame is a guess"),
-    ("Only Moving", 0.0, "1: your stream shows through where nothing moves in the footage"),
+    ("Mix", 1.0, "0: the input image, 1: the frozen frame"),
+    ("Wipe", 1.0, "The frozen frame is shown to the left of this position: 0 is the left edge, 1 the right edge"),
+    ("Only Supported", 0.0, "1: the input image is shown where the frozen frame is guessed"),
+    ("Only Moving", 0.0, "1: the input image is shown where nothing moves in the footage"),
 )
 _LOOKS = (
-    ("Splat", 0.0, "1: the splats alone, as they were before the plates' pixels came in"),
-    (INVENTED, 0.0, "1: what splats made up is tinted, what comes from a plate is not"),
+    ("Splat", 0.0, "1: only the splats, before pixels from the plates are added"),
+    (INVENTED, 0.0, "1: areas from splats are tinted, areas from a plate are not"),
 )
 """Factors that only takes with detail support."""
 _SOFTNESS_TIP = (
-    "Distance in scene units, before and behind a frozen surface, over which objects fade from in front to behind: for "
-    "hair, smoke and what touches. 0: a clean cut"
+    "Distance in scene units around a frozen surface over which objects fade from front to back, for "
+    "hair, smoke and contacts. 0: a hard edge"
 )
 _OUT = tuple(layer for layer in contract.FRAME_LAYERS if layer.output and layer.part != "passes")
 _PASSES = tuple(layer for layer in contract.layers_of("passes") if layer.output)
@@ -158,7 +158,7 @@ def add_sockets(group: bpy.types.NodeTree) -> set[str]:
             added.add(name)
         return compat.new_socket(group, name, side, kind, text)
 
-    new("Image", "INPUT", "NodeSocketColor", "Your stream, up to here")
+    new("Image", "INPUT", "NodeSocketColor", "Input image")
     for name, value, text in (*_FACTORS, *_LOOKS):
         socket = new(name, "INPUT", "NodeSocketFloat", text)
         if socket is not None:
@@ -166,7 +166,9 @@ def add_sockets(group: bpy.types.NodeTree) -> set[str]:
     grain = new(GRAIN, "INPUT", "NodeSocketFloat", "0: the frozen frame is clean, 1: it has as much grain as the plate")
     if grain is not None:
         grain.default_value, grain.min_value, grain.max_value = 0.0, 0.0, 10.0
-    cg = new("CG", "INPUT", "NodeSocketColor", "Rendered objects on a transparent film, to stand among the frozen")
+    cg = new(
+        "CG", "INPUT", "NodeSocketColor", "Objects rendered on a transparent film, to place among the frozen people"
+    )
     if cg is not None:
         cg.default_value = (0.0, 0.0, 0.0, 0.0)
     far = new("CG Depth", "INPUT", "NodeSocketFloat", "Depth pass of the rendered objects")
@@ -193,7 +195,7 @@ def update_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list
             if name not in outputs:
                 compat.new_socket(group, name, "OUTPUT", layer.socket, layer.tip)
         elif name in outputs and node.outputs[name].is_linked:
-            remarks.append(f"The take has no {name}, which your compositor uses: freeze it again with Passes.")
+            remarks.append(f"The take has no {name}, but your compositor uses it. Freeze again with Passes.")
         elif name in outputs:
             present(group.interface).remove(outputs[name])
     return remarks

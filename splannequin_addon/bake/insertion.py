@@ -42,7 +42,9 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
         wrong = cg_camera.difference(scene, frozen.folder, [numbers[0], numbers[-1]]) if numbers else ""
         changes += [wrong] if wrong else []
     if missing:
-        changes.append(f"{len(missing)} frames of the scene's range are not in the take, the first is {missing[0]}.")
+        changes.append(
+            f"The take lacks {len(missing)} frames of the scene's range. The first missing frame is {missing[0]}."
+        )
     return changes
 
 
@@ -58,13 +60,13 @@ def _need_warp(shot: Path, take: Take) -> None:
     name = take.folder.name
     if inventory.read(shot).takes.get(name, {}).get("camera_path"):
         raise contract.JobError(
-            f"The take {name!r} is seen from a camera of your own: its warp looks into other frames of the plate.",
-            "Use its frozen frames, or freeze a take on the clip's own camera.",
+            f"The take {name!r} was frozen from your own camera, so its warp needs other frames of the plate.",
+            "Use the take's frozen frames, or freeze a take from the clip's camera.",
             contract.ExitCode.BAKE,
         )
     if not any(take.plate_size):
         raise contract.JobError(
-            f"The take {name!r} has no warp: it was frozen without detail.",
+            f"The take {name!r} has no warp, because it was frozen without detail.",
             "Freeze it again with detail.",
             contract.ExitCode.BAKE,
         )
@@ -76,7 +78,7 @@ def _sources(scene: bpy.types.Scene, shot: Path, take: str) -> tuple[Take, Path 
         frozen = take_files.take_of(contract.ShotFolder(shot).takes / take, scene_objects.depth_scale(scene, shot))
     except FileNotFoundError as error:
         raise contract.JobError(
-            f"The take {take!r} of {shot.name} holds no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
+            f"The take {take!r} of {shot.name} has no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
         ) from error
     plate = contract.ShotFolder(shot).plate(frozen.first)
     return frozen, plate if plate.is_file() else None
@@ -197,7 +199,7 @@ def _turns(scene_uid: int, shot: Path, take: str, only: int) -> Iterator[None]:
             changes += rendering.choose_output(scene, shot, take)  # now, as part of the same undo step
             seen = scene.session_uid
         else:
-            changes.append(f"{scene.name} is in no window: it was not rendered.")
+            changes.append(f"{scene.name} is not open in any window, so it was not rendered.")
         return changes
 
     job_timer.change(job_timer.watch_of(shot), "bake", put_in, only)

@@ -24,11 +24,11 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
     frames = numbered.frame_numbers(folder.cryptomattes)
     if name not in inventory.mattes(folder) or not frames:
-        raise contract.JobError(f"The take has no matte {name}.", "Make it first.", contract.ExitCode.BAKE)
+        raise contract.JobError(f"The take has no matte {name}.", "Create it first.", contract.ExitCode.BAKE)
     tree = compat.compositor_tree(scene)
     if tree is None or library_of(tree) is not None:
         raise contract.JobError(
-            "This scene has no compositor of its own.", "Bake, or make one, first.", contract.ExitCode.BAKE
+            "This scene has no local compositor.", "Bake or create one first.", contract.ExitCode.BAKE
         )
     tree = compat.single_user_compositor_tree(scene)
     image = sequences.load_numbers(folder.cryptomatte(frames[0]), f"Mattes {take}")
@@ -36,7 +36,7 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
         size_of(image)  # loads the image: Blender 4.2 selects no matte from a sequence whose first image is not loaded
         image.source = "SEQUENCE"
     if any(_shows(node, folder.cryptomatte(frames[0]), name) for node in tree.nodes):
-        return [f"The node of the matte {name} is there already."]
+        return [f"The compositor already has a node for the matte {name}."]
     node: Any = tree.nodes.new("CompositorNodeCryptomatteV2")
     node.label, node.source = f"Matte {name}", "IMAGE"
     sequences.show_sequence(node, image, frames[0], frames[-1])
@@ -45,7 +45,7 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
     left = min((item.location.x for item in existing), default=0.0)
     low = min((item.location.y - item.height for item in existing), default=0.0)
     node.location = left, low - 200.0
-    return [f"The node Matte {name} was added: link its output Matte."]
+    return [f"The node Matte {name} was added. Link its output Matte."]
 
 
 def _quoted(name: str) -> str:
@@ -62,7 +62,7 @@ def _shows(node: bpy.types.Node, path: Path, name: str) -> bool:
 
 
 class SPLANNEQUIN_OT_insert_matte(bpy.types.Operator):
-    """Add a Cryptomatte node that picks this matte to your compositor, linked to nothing"""
+    """Add a Cryptomatte node for this matte to your compositor, without links"""
 
     bl_idname = "splannequin.insert_matte"
     bl_label = "Add Matte Node"

@@ -18,8 +18,8 @@ from . import cg_camera, freeze_group, insertion, progress, rendering
 
 
 class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
-    """Freeze those frames of the scene's range that are missing or stale, put the freeze before the output of the
-    scene's compositor, and render the range to the scene's output path"""
+    """Freeze missing or outdated frames of the scene's range, insert the freeze before the output of the scene's
+    compositor, and render the range to the scene's output path"""
 
     bl_idname = "splannequin.bake"
     bl_label = "Bake and Render"
@@ -105,7 +105,7 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
         progress.began(folder, run)
         try:
             if "CANCELLED" in bpy.ops.render.render(how, animation=True, scene=scene.name) and not run.done:
-                run.refused(RuntimeError("it was cancelled"))
+                run.refused(RuntimeError("the render was cancelled"))
         except RuntimeError as error:
             run.refused(error)
         if how == "EXEC_DEFAULT" or run.error is not None:
@@ -119,7 +119,7 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_insert_freeze(bpy.types.Operator):
-    """Put the frozen take before the output of the scene's compositor, or update it, without rendering"""
+    """Insert the frozen take before the output of the scene's compositor, or update it, without rendering"""
 
     bl_idname = "splannequin.insert_freeze"
     bl_label = "Insert Freeze in Compositor"
@@ -132,7 +132,7 @@ class SPLANNEQUIN_OT_insert_freeze(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_freeze_as_warp(bpy.types.Operator):
-    """Freeze your own plate, whatever is led into the group, instead of showing the take's frames: it keeps its own
+    """Freeze the image that is linked to the group instead of showing the take's frames, so that your plate keeps its
     grade, highlights and grain. Press again to show the take's frames"""
 
     bl_idname = "splannequin.freeze_as_warp"
@@ -148,11 +148,11 @@ class SPLANNEQUIN_OT_freeze_as_warp(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_combine_cg(bpy.types.Operator):
-    """Lead the scene's own render into the freeze, so that your objects stand in front of and behind the frozen people
-    by depth. Sets the film transparent and the depth pass on"""
+    """Link the scene's render into the freeze, so that your objects appear in front of or behind the frozen people by
+    depth. Makes the film transparent and turns on the depth pass"""
 
     bl_idname = "splannequin.combine_cg"
-    bl_label = "Combine with Scene's Objects"
+    bl_label = "Combine with Scene Objects"
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
@@ -161,8 +161,8 @@ class SPLANNEQUIN_OT_combine_cg(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_remove_shot(bpy.types.Operator):
-    """Take camera, points and the compositor group of this shot out of the file, and give the scene its own settings
-    back. The shot folder on disk stays"""
+    """Remove the camera, points and compositor group of this shot from the file, and restore the scene's settings. The
+    shot folder on disk is kept"""
 
     bl_idname = "splannequin.remove_shot"
     bl_label = "Remove Shot from Scene"

@@ -80,14 +80,14 @@ def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
         if footage["unlike"]:
             return None, f"{name}: {footage['unlike']}"
         if footage.get("orientation", 1) != 1 and not compat.TURNS_VIDEOS:
-            return None, f"{name}: it is turned by its header"
+            return None, f"{name}: its header rotates the image"
         places = [Path(str(footage["file"])), *([shot / str(footage["beside"])] if footage["beside"] else [])]
         file = next((place for place in places if place.is_file()), None)
         if file is None:
-            return None, f"{name} is not there any more"
+            return None, f"{name} no longer exists"
         st = take.folder / str(footage["map"]) if footage["map"] else None
         if st is not None and not st.is_file():
-            return None, "the take's ST map is gone"
+            return None, "the take's ST map no longer exists"
         width, height = (int(side) for side in footage["size"])
         probe = tuple(float(value) for value in footage["probe"])
         return Footage(file, (width, height), probe, str(footage["space"]), st, int(footage.get("shift") or 0)), ""
@@ -111,8 +111,8 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
     if footage.map is not None:
         st = sequences.load_numbers(footage.map, _map_name(take))
     width, height = footage.size
-    without = ", without its lens by the take's ST map" if st is not None else ""
-    remarks = [f"The plate is {footage.file.name} itself, {width} x {height}{without}."]
+    without = ", undistorted by the take's ST map" if st is not None else ""
+    remarks = [f"The footage {footage.file.name} is used as the plate, {width} x {height}{without}."]
     return Plate(image, st, remarks, footage.size, footage.shift)
 
 
@@ -148,7 +148,7 @@ def _image(footage: Footage, frames: tuple[int, int]) -> tuple[bpy.types.Image |
     try:
         image = sequences.load_sequence(footage.file, _name(footage), footage.probe, opaque=True)
     except ValueError:
-        return None, f"Blender's colour configuration has no space like {footage.space}"
+        return None, f"Blender's colour configuration has no colour space that matches {footage.space}"
     except RuntimeError:
         return None, f"Blender cannot read {footage.file.name}"
     size = sequences.shown_size(image, *frames, footage.shift)

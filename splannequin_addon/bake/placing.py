@@ -74,7 +74,7 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
         if where == "PLATE":
             raise contract.JobError(
                 "No node of this compositor shows the plate.",
-                "Select the Image or Movie Clip node that does, or insert before the output.",
+                "Select the Image or Movie Clip node that shows it, or insert before the output.",
                 contract.ExitCode.BAKE,
             )
         return None

@@ -71,7 +71,7 @@ def finish(shot: Path) -> None:
     except contract.JobError as error:
         watch.fail("bake", error)
     except (OSError, RuntimeError, ValueError) as error:
-        watch.failures["bake"] = f"The render of this shot ended in an error: {error}", "Bake again."
+        watch.failures["bake"] = f"The render of this shot failed: {error}", "Bake again."
     notes = [f"{len(run.done)} of {len(run.wanted)} frames rendered.", *run.notes]
     watch.notes.setdefault("bake", []).extend(note for note in notes if note not in watch.notes.get("bake", []))
 

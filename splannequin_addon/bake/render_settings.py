@@ -60,17 +60,23 @@ def _picture(name: str, value: Any, why: str) -> Setting:
 
 
 SETTINGS: tuple[Setting, ...] = (
-    Setting("render", "use_sequencer", (False,), "The sequencer was left out: it would replace the freeze.", "strips"),
+    Setting(
+        "render",
+        "use_sequencer",
+        (False,),
+        "The sequencer was not used, because it would replace the freeze.",
+        "strips",
+    ),
     _picture("use_compositing", True, "The compositor was switched on."),
     Setting("", "use_nodes", (True,), "The compositor was switched on."),
-    _picture("use_border", False, "The render region was left out: the bake renders whole frames."),
+    _picture("use_border", False, "The render region was not used, because a bake renders whole frames."),
     _picture("use_crop_to_border", False, ""),
-    _picture("use_multiview", False, "Stereoscopy was left out: the freeze has one view."),
-    _picture("use_single_layer", False, "All view layers were rendered, not the active one alone."),
-    _picture("use_stamp", False, "Burned-in metadata was left out."),
-    _picture("frame_map_old", 100, "Time remapping was left out: frame n shows frame n of the take."),
-    _picture("frame_map_new", 100, "Time remapping was left out: frame n shows frame n of the take."),
-    _picture("use_overwrite", True, "All frames of the range were rendered, also those that were there."),
+    _picture("use_multiview", False, "Stereoscopy was not used, because the freeze has one view."),
+    _picture("use_single_layer", False, "All view layers were rendered, not only the active one."),
+    _picture("use_stamp", False, "Burned-in metadata was not used."),
+    _picture("frame_map_old", 100, "Time remapping was not used, because frame n shows frame n of the take."),
+    _picture("frame_map_new", 100, "Time remapping was not used, because frame n shows frame n of the take."),
+    _picture("use_overwrite", True, "All frames of the range were rendered, including existing ones."),
     _picture("use_placeholder", False, ""),
     _picture("use_file_extension", True, ""),
     Setting("render", "film_transparent", (True,), "Film was set to transparent for the scene's objects.", "cg"),
@@ -119,7 +125,7 @@ def apply(scene: bpy.types.Scene, rows: Iterable[Setting]) -> list[str]:
         path = ".".join(filter(None, (row.owner, row.name)))
         if path in moving:
             raise contract.JobError(
-                f"The setting {path} of {scene.name} is animated, and a bake needs it as {row.values[0]}.",
+                f"The setting {path} of {scene.name} is animated, but a bake needs it to be {row.values[0]}.",
                 "Remove its keyframes or its driver.",
                 contract.ExitCode.BAKE,
             )
@@ -135,8 +141,8 @@ def apply(scene: bpy.types.Scene, rows: Iterable[Setting]) -> list[str]:
                 continue
             if now not in row.values and not _set(owner, row):
                 raise contract.JobError(
-                    f"The setting {row.name} of {scene.name} is {before}, and cannot be set to {row.values[0]}.",
-                    "Set it by hand, or switch Keep Plate Colours off.",
+                    f"The setting {row.name} of {scene.name} is {before} and cannot be set to {row.values[0]}.",
+                    "Set it manually, or turn Keep Plate Colours off.",
                     contract.ExitCode.BAKE,
                 )
             noted.append((row.owner, row.name, before, getattr(owner, row.name)))

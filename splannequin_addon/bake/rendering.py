@@ -161,7 +161,8 @@ class Run:
                     self.error = error
             if self._unreliable and self.error is None:
                 self.error = contract.JobError(
-                    f"The file was saved while frame {self._unreliable[0]} was rendered: that frame is not new.",
+                    f"The file was saved while frame {self._unreliable[0]} was being rendered, so that frame was "
+                    "not updated.",
                     "Bake again.",
                     contract.ExitCode.BAKE,
                 )
@@ -170,7 +171,7 @@ class Run:
                 self._publish_movie(is_whole)
             lost = [n for n in self.wanted if n not in set(self.done)]
             if is_whole and lost:
-                message = f"Blender wrote no picture for frame {lost[0]} in {self._folder_name()}."
+                message = f"Blender wrote no image for frame {lost[0]} in {self._folder_name()}."
                 raise self._write_error(message, None)
             if self.error is not None:
                 raise self.error
@@ -222,7 +223,7 @@ class Run:
     def _publish(self, path: Path, place: Path, what: str) -> None:
         """Moves a complete file to its final name. Raises JobError if it is incomplete, or OSError."""
         if not contract.is_whole_picture(path):
-            raise self._write_error(f"Blender wrote {what} only in part to {place.parent}.", path)
+            raise self._write_error(f"Blender wrote {what} only partially to {place.parent}.", path)
         with open(path, "rb+") as file:
             os.fsync(file.fileno())
         contract.make_folder(place.parent)
@@ -251,7 +252,7 @@ class Run:
         if is_full(self._temporary, self._room if path is None or not path.exists() else 1 << 18):
             return contract.disk_error(folder)
         return contract.JobError(
-            message, f"Can {folder} be written to? Blender's console may say more.", contract.ExitCode.BAKE
+            message, f"Make sure that {folder} is writable. Blender's console may show details.", contract.ExitCode.BAKE
         )
 
     def _folder_name(self) -> Path:
@@ -288,8 +289,8 @@ def render(
         compat.set_png(scene.render.image_settings)
     elif is_part and scene.render.is_movie_format:
         raise contract.JobError(
-            "The .blend writes a movie, which cannot be made in parts.",
-            "Choose pictures as its output format.",
+            "The .blend file outputs a movie, which cannot be rendered in parts.",
+            "Choose an image format for the output.",
             contract.ExitCode.BAKE,
         )
     run = Run(scene, folder, png or is_part, on_frame, check_cancelled, check)
@@ -334,7 +335,7 @@ def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
     if lost:
         raise contract.JobError(
             f"{folder} lacks {len(lost)} of {len(wanted)} frames, the first is {lost[0]}.",
-            "Bake the part that it belongs to again.",
+            "Bake the part with the missing frames again.",
             contract.ExitCode.BAKE,
         )
     for left in folder.glob(f"{_PART_PREFIX}*"):
@@ -363,7 +364,7 @@ def _named(scene: bpy.types.Scene, frames: list[int]) -> dict[int, Path]:
     except RuntimeError as error:
         raise contract.JobError(
             f"Blender cannot use the output path of {scene.name}: {' '.join(str(error).split())}",
-            "Choose another one; for a brace in a name write two.",
+            "Choose another path. To use a brace in a name, write it twice.",
             contract.ExitCode.BAKE,
         ) from error
 
@@ -386,8 +387,8 @@ def _set_output_path(scene: bpy.types.Scene, pattern: Path, frames: list[int]) -
 
 def _unusable(folder: Path) -> contract.JobError:
     return contract.JobError(
-        f"Blender cannot write pictures to {contract.printable(str(folder), 300)}: the name is too long, or has "
-        "letters that Blender does not know.",
+        f"Blender cannot write images to {contract.printable(str(folder), 300)}: the path is too long or has "
+        "unsupported characters.",
         "Choose another output folder.",
         contract.ExitCode.USAGE,
     )
@@ -402,7 +403,7 @@ def _output_notes(scene: bpy.types.Scene) -> list[str]:
     render, found = scene.render, list[str]()
     if render.resolution_percentage != 100:
         width, height = scene_setup.render_size(scene)
-        found.append(f"The scene renders at {render.resolution_percentage} %: pictures have {width} x {height} pixels.")
+        found.append(f"The scene renders at {render.resolution_percentage} %: images have {width} x {height} pixels.")
     if render.image_settings.color_mode == "BW":
         found.append("The scene's output is black and white.")
     return found

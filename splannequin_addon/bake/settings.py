@@ -10,18 +10,18 @@ class BakeSettings:
 
     keep_colours = BoolProperty(
         name="Keep Plate Colours",
-        description="Set the view transform to Standard and dither to 0, so that pictures leave with the colours they "
-        "came in with. Blender's default view changes them",
+        description="Set the view transform to Standard and dither to 0, so that rendered images keep the plate's "
+        "colours. Blender's default view transform changes them",
         default=True,
         options=set(),
     )
     insert_at = EnumProperty(
         name="Insert",
-        description="Where the freeze goes in a compositor that you have built",
+        description="Where to insert the freeze in your compositor",
         items=[
-            ("AUTO", "Automatic", "As the plate where a node shows it, else before the output"),
-            ("PLATE", "As Plate", "Behind the node that shows the plate, so that your grade goes on from there"),
-            ("OUTPUT", "Before Output", "Behind everything else"),
+            ("AUTO", "Automatic", "In place of the plate if a node shows it, otherwise before the output"),
+            ("PLATE", "As Plate", "After the node that shows the plate, so that your grade applies to the freeze"),
+            ("OUTPUT", "Before Output", "After all other nodes"),
         ],
         default="AUTO",
         options=set(),

@@ -52,19 +52,19 @@ class Bake(Step):
         if state is None or (props.take_name not in state.takes and props.run_name not in state.runs):
             return View(False, False, [], self.needs)
         if props.take_name not in state.takes:
-            advice = "Freezes the scene's range, puts it before your compositor's output and renders."
+            advice = "Freezes the scene's range, inserts it before your compositor's output and renders."
             return View(False, True, [], advice)
         tree = compat.compositor_tree(scene)
         if tree is None or freeze_group.group_node(tree) is None:
-            return View(False, True, [], "Put the freeze before your compositor's output and render.")
+            return View(False, True, [], "Insert the freeze before your compositor's output and render.")
         found, take = freeze_group.shown(scene), shown_take.shown(scene, state.folder)
         if found is not None and take != settings_of(scene).take_name:
             shown = f"take {take}" if take else f"another shot, {scene_objects.name_of(found[0].parent.parent)}"
-            lines = [f"Your compositor shows {shown}: the one that was baked last."]
-            return View(False, True, lines, "Baking puts this take in its place.")
+            lines = [f"Your compositor shows {shown}, which was baked last."]
+            return View(False, True, lines, "Baking replaces it with this take.")
         lines = ["The freeze is in your compositor."]
         if shown_take.stale_scale(scene, state.folder):
-            lines.append("The shot was scaled since: its depth is stale until you bake again.")
+            lines.append("The shot was scaled after the bake. Its depth is outdated until you bake again.")
         if not scene_setup.keeps_plate_colours(scene):
             lines.append(
                 f"The view transform {present(scene.view_settings).view_transform} changes the plate's colours."
@@ -97,12 +97,12 @@ class Bake(Step):
 
         Selecting a shot starts no render and keeps the other take in the compositor.
         """
-        return "Its frames were rendered meanwhile. Bake again to put them into your compositor."
+        return "The shot's frames were rendered in the meantime. Bake again to insert them into your compositor."
 
     def in_use(self, shot: Path, folder: Path) -> str:
         """The reason why a take cannot be deleted: this file shows its frames. Empty if it does not."""
         if shown(folder):
-            return "The compositor shows this take: bake another one, or remove the shot from the scene, first"
+            return "The compositor shows this take. Bake another take or remove the shot from the scene first."
         return ""
 
     def is_present(self, scene: bpy.types.Scene, shot: Path) -> bool:
@@ -112,7 +112,7 @@ class Bake(Step):
     def remove(self, scene: bpy.types.Scene, shot: Path, remaining: list[Path]) -> list[str]:
         """Removes the freeze from the compositor, unless it belongs to another shot."""
         gone = _baked(scene) not in remaining and insertion.remove(scene)
-        return ["The freeze left the compositor."] if gone else []
+        return ["The freeze was removed from the compositor."] if gone else []
 
     def scaled(self, scene: bpy.types.Scene, shot: Path) -> list[str]:
         """Updates the depth factor in the compositor, since depth is in scene units."""

@@ -38,7 +38,7 @@ def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
     """The take in a folder. Raises FileNotFoundError if the folder has no frozen frames."""
     numbers = numbered.frame_numbers(folder)
     if not numbers:
-        raise contract.MissingError(f"{folder} holds no frozen frames (NNNNNN.exr)")
+        raise contract.MissingError(f"{folder} has no frozen frames (NNNNNN.exr)")
     first = numbered.frame_path(folder, numbers[0])
     light = _exr_value(_exr_header(first), "splannequin:probe", "v3f", "<3f") or "linear"
     size, margin = exr_windows(first)
@@ -64,13 +64,11 @@ def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     header = _exr_header(path)
     frame, data = (_exr_value(header, name, "box2i", "<4i") for name in ("displayWindow", "dataWindow"))
     if frame is None or data is None:
-        raise contract.UserError(f"{path} is no OpenEXR file: render the take again")
+        raise contract.UserError(f"{path} is not an OpenEXR file. Freeze the take again.")
     (left, top, right, bottom), (data_left, data_top, data_right, data_bottom) = frame, data
     margin = (left - data_left, top - data_top)
     if margin != (data_right - right, data_bottom - bottom) or min(margin) < 0:
-        raise contract.UserError(
-            f"{path} does not reach equally far beyond its frame on all sides: render the take again"
-        )
+        raise contract.UserError(f"{path} has different overscan on opposite sides. Freeze the take again.")
     return (right - left + 1, bottom - top + 1), margin
 
 

@@ -69,7 +69,7 @@ def main(argv: Sequence[str]) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     except (contract.Cancelled, KeyboardInterrupt):
-        print("Cancelled. Start the same command again to go on: finished work is kept.", file=sys.stderr)
+        print("Cancelled. Run the same command again to continue: finished work is kept.", file=sys.stderr)
         return ExitCode.CANCELLED
     except contract.JobError as error:
         print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
@@ -195,7 +195,7 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
     if last < first:
         raise contract.JobError(
             f"The last frame, {last}, comes before the first, {first}.",
-            "Name both with --first and --last.",
+            "Set both with --first and --last.",
             ExitCode.USAGE,
         )
     span = range(first, last + 1, args.step if args.step > 0 else scene.frame_step)
@@ -231,7 +231,7 @@ def _bake_a_part(
     if not takes.complete(shot, args.take, span):
         raise contract.JobError(
             f"Take {args.take} of {shot.name} lacks frames from {span.start} to {span.stop - 1}.",
-            "Freeze it first: a part of a bake freezes none.",
+            "Freeze it first. A bake with --part does not freeze frames.",
             ExitCode.BAKE,
         )
     if cameras.find(scene, shot, "CAMERA") is None and contract.ShotFolder(shot).cameras.is_file():
@@ -310,7 +310,7 @@ def _scene(blend: str) -> tuple[Any, bool]:
     if blend:
         path = Path(blend).absolute()
         if not path.is_file():
-            raise contract.MissingError(f"{path} does not exist: --blend names a .blend file")
+            raise contract.MissingError(f"{path} does not exist. --blend needs a .blend file.")
         try:
             # The file may come from a stranger, so its scripts and its drivers with Python do not run.
             bpy.ops.wm.open_mainfile(filepath=str(path), use_scripts=False)
@@ -323,8 +323,8 @@ def _scene(blend: str) -> tuple[Any, bool]:
         bpy.context.view_layer.update()  # drivers are only reported once they are evaluated
         if bpy.app.autoexec_fail:
             print(
-                f"Note: {path.name} has Python in it, which was not run ({bpy.app.autoexec_fail_message}). "
-                "If its picture depends on that, bake what the Python does into keys, and save the file.",
+                f"Note: {path.name} contains Python that was not run ({bpy.app.autoexec_fail_message}). If the image "
+                "depends on it, bake its result into keyframes and save the file.",
                 file=sys.stderr,
             )
     if bpy.data.filepath:
@@ -429,7 +429,9 @@ def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
             message = f"{blend.name} could not be saved: {str(error).strip()}"
             if rendering.is_full(blend.parent, os.path.getsize(half) if half.exists() else 1 << 20):
                 raise contract.disk_error(blend.parent, message) from error
-            raise contract.JobError(f"{message}.", f"Can {blend.parent} be written to?", ExitCode.BAKE) from error
+            raise contract.JobError(
+                f"{message}.", f"Make sure that {blend.parent} is writable.", ExitCode.BAKE
+            ) from error
         finally:
             files.save_version = backups
         if backups and blend.exists():
@@ -450,7 +452,7 @@ def _shot(args: argparse.Namespace) -> Path:
     """The shot folder that a command names. Raises JobError if it does not exist."""
     shot = Path(args.shot).absolute()
     if not inventory.read(shot).info:
-        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+        raise contract.JobError(f"{shot} is not a shot folder.", "Specify the .splannequin folder.", ExitCode.USAGE)
     return shot
 
 
@@ -481,7 +483,7 @@ _COMMANDS = {
     "doctor": doctor,
 }
 """Command -> its function."""
-_UNSET = {"device": "as the preferences say"}
+_UNSET = {"device": "from the add-on's preferences"}
 """Field -> description of its default, used if the command line does not set it."""
 
 

@@ -40,7 +40,7 @@ def fit(scene: bpy.types.Scene, state: ShotState, force_k: bool = False) -> list
     """
     props = settings_of(scene)
     if not (props.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
-        return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]
+        return ["The scene's resolution and frame range were not changed (Fit Scene to Clip is off)."]
     size, k = state.size, None
     if force_k:
         path = contract.CameraPath.load(contract.ShotFolder(state.folder).cameras)

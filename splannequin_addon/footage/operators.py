@@ -29,7 +29,7 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
     bl_label = "Use as Splannequin Clip"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath = StringProperty(name="File", description="Video to be used", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath = StringProperty(name="File", description="Video to use", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_movie = BoolProperty(name="Movies Only", description="Show videos only", default=True, options={"HIDDEN"})
     filter_folder = BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 
@@ -44,7 +44,7 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
         """Sets the clip. If the selected shot is already imported, another clip starts a new shot."""
         props = settings_of(scene_in(context))
         if not self.filepath:
-            self.report({"ERROR"}, "No file was given")
+            self.report({"ERROR"}, "No file is chosen")
             return {"CANCELLED"}
         clip = paths.absolute(self.filepath)
         known = [i for i, one in enumerate(selection.settings(scene_in(context))) if _is_of(one, clip)]
@@ -98,7 +98,7 @@ class SPLANNEQUIN_PT_movie_clip(bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """One button. The five steps are in the 3D view."""
         layout_of(self).operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
-        layout_of(self).label(text="Then see the 3D view's sidebar.", icon="INFO")
+        layout_of(self).label(text="Continue in the 3D view's sidebar.", icon="INFO")
 
 
 class SPLANNEQUIN_FH_video(bpy.types.FileHandler):
@@ -116,7 +116,7 @@ class SPLANNEQUIN_FH_video(bpy.types.FileHandler):
 
 
 class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator):
-    """Take the clip's frames into the shot folder and check them"""
+    """Import the clip's frames into the shot folder and check them"""
 
     bl_idname = "splannequin.import_clip"
     bl_label = "Import Clip"
@@ -125,7 +125,8 @@ class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator)
 
     replace = BoolProperty(
         name="Replace",
-        description="Import other frames into a shot on which work was done: that work moves to a folder in the shot",
+        description="Import other frames into a shot that already has results. The results move to a folder in "
+        "the shot",
         default=False,
         options={"SKIP_SAVE"},
     )
@@ -155,11 +156,11 @@ def replaces(scene: bpy.types.Scene) -> str:
     work = ", ".join(contract.work_words(contract.ShotFolder(folder)))
     if clip and source.is_of(folder, clip) is False:
         source_name = contract.printable(source.named(folder))
-        question = f"{folder.name} is the shot of {source_name}: its frames are replaced."
-        return f"{question} What was made from them moves to its folder replaced: {work}." if work else question
+        question = f"{folder.name} is the shot of {source_name}. Its frames will be replaced."
+        return f"{question} Earlier results move to the shot's folder replaced: {work}." if work else question
     if not work:
         return ""
-    return f"{folder.name} holds work. Where other frames are imported, it moves to the shot's folder replaced: {work}."
+    return f"{folder.name} contains results. Importing other frames moves them to the shot's folder replaced: {work}."
 
 
 CLASSES = (

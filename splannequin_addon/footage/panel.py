@@ -44,7 +44,7 @@ class ImportPanel(step_panel.StepPanel):
             column = box.column(align=True)
             column.alert = True
             name = watch.shot.name
-            wrap(column, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
+            wrap(column, context, f"The shot folder {name} was moved, renamed or deleted.", "ERROR")
             box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
 
     def _backend_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
@@ -66,7 +66,7 @@ class ImportPanel(step_panel.StepPanel):
     def _label(self, context: bpy.types.Context, view: steps.View) -> str:
         watch = self._watch(context)
         gone = watch is not None and selection.missing(scene_in(context), watch.state)
-        return "Import Anew" if gone else super()._label(context, view)
+        return "Import from Scratch" if gone else super()._label(context, view)
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Shot folder, solved frames, colour, and the option to set up the scene."""

@@ -17,13 +17,13 @@ class ImportSettings:
     )
     shot_path = StringProperty(
         name="Shot Folder",
-        description="Folder that keeps everything of this shot; empty: made beside the clip",
+        description="Folder for all files of this shot; empty: a new folder next to the clip",
         subtype="DIR_PATH",
         options=compat.PATH_OPTIONS,
     )
     shot_seen = StringProperty(
-        name="Shot Seen",
-        description="Shot folder that was there when this file was last at work: it can be missed",
+        name="Last Seen Shot",
+        description="Shot folder that existed when this file was last used, so that a missing folder is noticed",
         subtype="DIR_PATH",
         options={*compat.PATH_OPTIONS, "HIDDEN"},
     )
@@ -39,8 +39,8 @@ class ImportSettings:
         options=set(),
     )
     use_start = BoolProperty(
-        name="First Frame of Its Own",
-        description="Number the shot's frames from a number of your own instead of as the clip's files do",
+        name="Custom First Frame",
+        description="Start the shot's frame numbers at a custom number instead of using the clip's numbers",
         default=False,
         options=set(),
     )

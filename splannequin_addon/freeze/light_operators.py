@@ -16,9 +16,9 @@ from . import lights, takes
 
 
 class SPLANNEQUIN_OT_add_light(takes.NeedsTake, step_operator.StepOperator, bpy.types.Operator):
-    """Render the chosen take's frozen scene from the 3D cursor into a panorama, and light the scene with it as its
-    world, as bright as the plate is. An estimate: what no plate saw is filled smoothly. Your own world comes back
-    when the light is removed"""
+    """Render a panorama of the chosen take's frozen scene from the 3D cursor, and use it as the scene's world, as
+    bright as the plate. It is an estimate: areas that no plate shows are filled smoothly. Removing the light restores
+    the previous world"""
 
     bl_idname = "splannequin.add_light"
     bl_label = "Add Light from the Shot"
@@ -38,7 +38,7 @@ class SPLANNEQUIN_OT_add_light(takes.NeedsTake, step_operator.StepOperator, bpy.
 
 
 class SPLANNEQUIN_OT_remove_light(bpy.types.Operator):
-    """Remove the light of this shot. The scene has the world again that it had before"""
+    """Remove the light of this shot and restore the scene's previous world"""
 
     bl_idname = "splannequin.remove_light"
     bl_label = "Remove Light"
@@ -50,7 +50,7 @@ class SPLANNEQUIN_OT_remove_light(bpy.types.Operator):
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         if folder is None or lights.find(scene, folder) is None:
-            cls.poll_message_set(tr("This shot lights nothing here"))
+            cls.poll_message_set(tr("This shot has no light in this scene"))
             return False
         return True
 

@@ -30,7 +30,7 @@ def add(scene: bpy.types.Scene, shot: Path, take: str, key: str) -> list[str]:
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
     facts = contract.light_of_take(folder, key)
     if facts is None:
-        raise contract.JobError(f"Take {take} has no such light.", "Make it again.", contract.ExitCode.USAGE)
+        raise contract.JobError(f"Take {take} does not have this light.", "Create it again.", contract.ExitCode.USAGE)
     root = present(scene_objects.part(scene, shot, "root"))
     image = _image(folder.light(key))
     world = _world(f"{scene_objects.name_of(shot)} {take} light", image, root, facts)
@@ -39,8 +39,8 @@ def add(scene: bpy.types.Scene, shot: Path, take: str, key: str) -> list[str]:
     scene_objects.new(scene, shot).light = world
     scene.world = world
     return [
-        f"The light of take {take} is the scene's world. It is an estimate: {100.0 * facts.filled:.0f} % of it was not "
-        "seen by any plate and is filled."
+        f"The light of take {take} is now the scene's world. It is an estimate: {100.0 * facts.filled:.0f} % "
+        "of it is not visible in any plate and is filled in."
     ]
 
 

@@ -130,13 +130,13 @@ class Session:
             while (message := contract.read_message(answers)) is not None:
                 self._take_in(*message)
         except (OSError, ValueError, KeyError, TypeError) as error:
-            self._fail(f"The live session broke: {error}.", f"Start it again. Its log is {log}.")
+            self._fail(f"The live session stopped unexpectedly: {error}.", f"Start it again. Its log is {log}.")
         process.stdout.close()
         code = process.wait()
         if not self._closed and self.failure is None:
             words = last_line(log)
             log_line = f" Last line of its log: {words}" if words else ""
-            self._fail(f"The live session ended without a word (exit code {code}).{log_line}", "Start it again.")
+            self._fail(f"The live session ended unexpectedly (exit code {code}).{log_line}", "Start it again.")
 
     def _take_in(self, header: dict[str, Any], body: bytes) -> None:
         if header["kind"] == "ready":

@@ -18,7 +18,7 @@ from . import mattes, takes
 
 
 class SPLANNEQUIN_OT_draw_matte(takes.NeedsTake, bpy.types.Operator):
-    """Show the frozen frames in an Image Editor, to draw a mask around a person or a thing"""
+    """Show the frozen frames in an Image Editor, to draw a mask around a person or an object"""
 
     bl_idname = "splannequin.draw_matte"
     bl_label = "Draw on Frozen Frame"
@@ -40,7 +40,7 @@ class SPLANNEQUIN_OT_draw_matte(takes.NeedsTake, bpy.types.Operator):
         if space is not None:
             space.image, space.ui_mode, space.mask = image, "MASK", props.matte_mask
             sequences.show_sequence(space.image_user, image, first, last)
-        self.report({"INFO"}, tr(f"Frames {first} to {last} can be drawn on."))
+        self.report({"INFO"}, tr(f"You can draw on frames {first} to {last}."))
         return {"FINISHED"}
 
 
@@ -56,8 +56,8 @@ def _editor(context: bpy.types.Context) -> Any:
 
 
 class SPLANNEQUIN_OT_matte_from_mask(takes.NeedsTake, step_operator.StepOperator, bpy.types.Operator):
-    """Make a matte for every frame of the take from what the mask surrounds at the current frame. It has the mask's
-    name; drawn again at another frame, it adds to it"""
+    """Create a matte for every frame of the take from the area inside the mask at the current frame. It gets the mask's
+    name. Drawing the mask again at another frame adds to the matte"""
 
     bl_idname = "splannequin.matte_from_mask"
     bl_label = "Matte from Mask"
@@ -70,7 +70,7 @@ class SPLANNEQUIN_OT_matte_from_mask(takes.NeedsTake, step_operator.StepOperator
 
 
 class SPLANNEQUIN_OT_remove_matte(step_operator.StepOperator, bpy.types.Operator):
-    """Delete a matte of the take from the shot folder on disk, after a question"""
+    """Delete a matte of the take from the shot folder on disk, after confirmation"""
 
     bl_idname = "splannequin.remove_matte"
     bl_label = "Remove Matte"
@@ -92,24 +92,25 @@ class SPLANNEQUIN_OT_remove_matte(step_operator.StepOperator, bpy.types.Operator
 
 
 class SPLANNEQUIN_OT_combine_takes(step_operator.StepOperator, bpy.types.Operator):
-    """Make a take in which this thing is as another take has it, or goes on living; all else is the chosen take's"""
+    """Create a take that shows this object as in another take, or live as in the clip. Everything else comes from the
+    chosen take"""
 
     bl_idname = "splannequin.combine_takes"
-    bl_label = "Instant of Its Own"
+    bl_label = "Separate Instant"
     bl_options = {"REGISTER", "INTERNAL"}
     step = "freeze"
 
-    name = StringProperty(name="Matte", description="Name of the thing's matte", options={"SKIP_SAVE"})
+    name = StringProperty(name="Matte", description="Name of the object's matte", options={"SKIP_SAVE"})
     source = StringProperty(
         name="From",
-        description="Take that has this thing as you want it, with a matte of the same name; live: it goes on living "
+        description="Take that shows this object as you want it, with a matte of the same name; live: the object moves "
         "as in the clip",
         default=contract.LIVE_SOURCE,
         options=set(),
         search=lambda self, context, text: mattes.sources_of(scene_in(context), str(getattr(self, "name", ""))),
         search_options={"SUGGESTION"},
     )
-    result = StringProperty(name="Into", description="Name of the take that is made", default="combined", options=set())
+    result = StringProperty(name="Into", description="Name of the new take", default="combined", options=set())
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Asks for the source take and for a name."""

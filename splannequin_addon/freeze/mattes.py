@@ -36,7 +36,7 @@ def params_of(scene: bpy.types.Scene, shot: Path) -> contract.MatteParams:
     drawn = polygons(mask, int(facts["width"]), int(facts["height"]))
     if not drawn:
         raise contract.JobError(
-            f"Nothing is drawn in the mask {name}.", "Draw a closed spline around the thing.", contract.ExitCode.USAGE
+            f"Nothing is drawn in the mask {name}.", "Draw a closed spline around the object.", contract.ExitCode.USAGE
         )
     if inventory.missing_frames(shot, props.take_name, [frame]):
         raise contract.JobError(
@@ -50,7 +50,7 @@ def params_of(scene: bpy.types.Scene, shot: Path) -> contract.MatteParams:
         contract.write_json(path, {"mattes": rows}, parents=False)
     except OSError as error:
         raise inventory.unwritable(
-            path, error, "Make room, or see to it that the shot's folder can be written."
+            path, error, "Free disk space, or make sure that the shot folder is writable."
         ) from error
     return contract.MatteParams(take=props.take_name, polygons=str(path), device=backend.device())
 
@@ -126,7 +126,7 @@ def frozen_sequence(shot: Path, name: str) -> tuple[bpy.types.Image, int, int]:
     folder, facts = take_of(shot, name), inventory.read(shot).takes[name]
     path = folder.preview(facts["first"])
     if not path.is_file():
-        raise contract.JobError(f"{path} is not there.", "Freeze again.", contract.ExitCode.USAGE)
+        raise contract.JobError(f"{path} does not exist.", "Freeze again.", contract.ExitCode.USAGE)
     image = sequences.load_sequence(path, f"Frozen {name} of {scene_objects.name_of(shot)}", "srgb")
     return image, facts["first"], facts["last"]
 

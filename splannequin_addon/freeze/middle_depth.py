@@ -73,7 +73,7 @@ def _unpacked(packed: bytes, size: int) -> np.ndarray:
         return np.frombuffer(packed, np.uint8)
     unzipped = np.frombuffer(zlib.decompressobj().decompress(packed, size), np.uint8)
     if len(unzipped) != size:
-        raise ValueError("a chunk of another size")
+        raise ValueError("a chunk has an unexpected size")
     steps = unzipped.copy()
     steps[1:] -= 128
     halves = np.cumsum(steps, dtype=np.uint8)

@@ -50,7 +50,7 @@ class Guesses:
         mean = sum(self.shares.values()) / len(self.shares)
         worst = max(self.shares, key=lambda frame: self.shares[frame])
         sentences = [
-            f"Seen from {self.camera}, about {_percent(mean)} % of the picture is a guess.",
+            f"Seen from {self.camera}, about {_percent(mean)} % of the image is guessed.",
             f"Most of it in frame {worst}: {_percent(self.shares[worst])} %.",
         ]
         return " ".join(sentences)
@@ -102,7 +102,7 @@ def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_tim
             drawn.ask(view)
             while drawn.busy(_VIEW):
                 _still_open(drawn)
-                yield job_timer.Progress("Looking at the camera's pictures", len(shares), len(path.frames))
+                yield job_timer.Progress("Checking the camera's images", len(shares), len(path.frames))
             shares[frame.frame] = share_of(drawn.frames.get(_VIEW), view)
         return Guesses(name, shares)
     finally:
@@ -115,7 +115,7 @@ def share_of(frame: live.Frame | None, request: contract.LiveView) -> float:
     """Fraction of a drawn view's pixels that are guesses, 0..1. Raises JobError if the frame answers another
     request."""
     if frame is None or frame.request.seq != request.seq:
-        raise contract.JobError("The backend could not draw what the camera sees.", "Try again.")
+        raise contract.JobError("The backend could not render the camera's view.", "Try again.")
     return float(np.count_nonzero(frame.rgba[..., 0] < _SUPPORTED) / max(1, frame.rgba[..., 0].size))
 
 
@@ -142,7 +142,7 @@ def _in_turns(scene_uid: int, shot: Path, name: str) -> Generator[job_timer.Prog
 
 
 class SPLANNEQUIN_OT_check_move(step_operator.StepOperator, bpy.types.Operator):
-    """Draw small pictures along the chosen camera and say how much of them will be a guess, before you freeze"""
+    """Render small images along the chosen camera and show how much of them will be guessed, before you freeze"""
 
     bl_idname = "splannequin.check_move"
     bl_label = "Check Move"
@@ -156,7 +156,7 @@ class SPLANNEQUIN_OT_check_move(step_operator.StepOperator, bpy.types.Operator):
         folder = selection.shot_folder(scene)
         state = job_timer.watch_of(folder).state if folder else None
         if not own_camera.name_of(scene):
-            cls.poll_message_set(tr("Choose a camera or make a move first"))
+            cls.poll_message_set(tr("Choose a camera or create a move first"))
             return False
         if state is None or settings_of(scene).run_name not in state.runs:
             cls.poll_message_set(tr("Train first"))

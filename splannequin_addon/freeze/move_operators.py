@@ -51,7 +51,7 @@ def clip_path(shot: Path) -> ClipPath:
     """The solved camera of a shot. Raises FileNotFoundError or ValueError, which name the file."""
     solved = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
     if not solved.frames:
-        raise contract.UserError(f"{shot} has no solved camera: solve again")
+        raise contract.UserError(f"{shot} has no solved camera. Solve again.")
     numbers = np.array([f.frame for f in solved.frames], dtype=np.float64)
     poses = moves.filled(numbers, axes.poses(solved))
     lenses = moves.between(numbers[0] + np.arange(len(poses), dtype=np.float64), numbers, cameras.lenses_of(solved))
@@ -122,17 +122,17 @@ class _Move(OperatorBase):
 
 _FIT: dict[str, Any] = {
     "name": "Set Frame Range",
-    "description": "Set the scene's range to the frames of the move: Freeze renders the scene's range",
+    "description": "Set the scene's range to the frames of the move. Freeze renders the scene's range",
     "default": True,
 }
 _FRAME: dict[str, Any] = {
     "name": "Frame",
-    "description": "Frame of the clip at which the camera stops; the current one at first",
+    "description": "Frame of the clip at which the camera stops. The default is the current frame",
     "options": {"SKIP_SAVE"},
 }
 _SMOOTH: dict[str, Any] = {
     "name": "Smooth",
-    "description": "How far the clip's own path is stabilised first, as by Smooth Move",
+    "description": "Strength with which the clip's path is stabilised first, as in Smooth Move",
     "default": 0.0,
     "min": 0.0,
     "max": 1.0,
@@ -151,8 +151,9 @@ class SPLANNEQUIN_OT_move_smooth(_Move, bpy.types.Operator):
 
     position = FloatProperty(
         name="Position",
-        description="How far the camera's position is stabilised. At 1 sways of a period up to the clip's length are "
-        "removed, at 0.5 of up to half of it",
+        description="Strength with which the camera's position is stabilised. 1 removes sway with a period of "
+        "up to the "
+        "clip's length, 0.5 of up to half of it",
         default=0.25,
         min=0.0,
         max=1.0,
@@ -160,7 +161,7 @@ class SPLANNEQUIN_OT_move_smooth(_Move, bpy.types.Operator):
     )
     rotation = FloatProperty(
         name="Rotation",
-        description="How far the camera's rotation is stabilised, as its position",
+        description="Strength with which the camera's rotation is stabilised, with the same scale as the position",
         default=0.25,
         min=0.0,
         max=1.0,
@@ -253,8 +254,8 @@ class SPLANNEQUIN_OT_move_hold(_Stops, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_move_orbit(_Stops, bpy.types.Operator):
-    """Add a camera that follows the clip's path, orbits what is in the middle of the picture at a frame and comes back,
-    and freeze from it"""
+    """Add a camera that follows the clip's path, orbits the subject in the middle of the image at one frame and
+    returns, and freeze from it"""
 
     bl_idname = "splannequin.move_orbit"
     bl_label = "Orbit Move"
@@ -281,8 +282,8 @@ class SPLANNEQUIN_OT_move_orbit(_Stops, bpy.types.Operator):
     )
     distance = FloatProperty(
         name="Distance",
-        description="Depth of the orbit's centre, in scene units; 0: that of the take in the middle of the picture, "
-        "without a take the median of the solve's points",
+        description="Depth of the orbit's centre, in scene units. 0: depth of the take in the middle of the image, or "
+        "the median depth of the solve's points without a take",
         default=0.0,
         min=0.0,
         subtype="DISTANCE",

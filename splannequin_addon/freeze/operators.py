@@ -15,7 +15,7 @@ from . import own_camera, splats, takes, viewport
 
 
 class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
-    """Render time standing still at t*: from every pose of the clip, or from an animated camera of your own"""
+    """Render the scene frozen at t*, from every camera pose of the clip or from your own animated camera"""
 
     bl_idname = "splannequin.freeze"
     bl_label = "Freeze"
@@ -37,7 +37,7 @@ class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
-    """Let time stand still at the current frame"""
+    """Freeze time at the current frame"""
 
     bl_idname = "splannequin.t_star_here"
     bl_label = "Set t* from Current Frame"
@@ -58,7 +58,7 @@ class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_t_star_marker(bpy.types.Operator):
-    """Show t* as a marker on the timeline, to be dragged; press again to take it away"""
+    """Show t* as a draggable marker on the timeline. Press again to remove it"""
 
     bl_idname = "splannequin.t_star_marker"
     bl_label = "Marker for t*"
@@ -71,7 +71,7 @@ class SPLANNEQUIN_OT_t_star_marker(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_live(bpy.types.Operator):
-    """Draw the frozen instant over the 3D view while you scrub t* and move the view; press again to stop"""
+    """Draw the frozen instant over the 3D view while you scrub t* and move the view. Press again to stop"""
 
     bl_idname = "splannequin.live"
     bl_label = "Scrub in View"
@@ -106,13 +106,13 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
-    """Set t* to the previous or next suggested instant: one that saw most of what moves, and whose plate is sharp"""
+    """Set t* to the previous or next suggested instant, whose plate is sharp and shows most of what moves"""
 
     bl_idname = "splannequin.suggested_instant"
     bl_label = "Suggested Instant"
     bl_options = {"REGISTER", "UNDO"}
 
-    step = IntProperty(name="Step", description="1: the next one, -1: the one before", default=1)
+    step = IntProperty(name="Step", description="1: next suggestion, -1: previous suggestion", default=1)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -135,7 +135,7 @@ class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_pick_take(pick_operators.Pick, bpy.types.Operator):
-    """Work with this take: it is shown, and baked next"""
+    """Use this take for display and for the next bake"""
 
     bl_idname = "splannequin.pick_take"
     bl_label = "Pick Take"
@@ -155,7 +155,7 @@ class SPLANNEQUIN_OT_pick_take(pick_operators.Pick, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_remove_take(pick_operators.Remove, bpy.types.Operator):
-    """Delete the frozen frames of this take from the shot folder on disk, after a question"""
+    """Delete the frozen frames of this take from the shot folder on disk, after confirmation"""
 
     bl_idname = "splannequin.remove_take"
     bl_label = "Remove Take"
@@ -168,8 +168,8 @@ class SPLANNEQUIN_OT_remove_take(pick_operators.Remove, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_add_splats(takes.NeedsTake, bpy.types.Operator):
-    """Bring the frozen splats of the chosen take into the scene, under the shot's root, to place things among them.
-    They are not rendered unless you switch that on"""
+    """Add the frozen splats of the chosen take to the scene under the shot's root, to place objects among them. They
+    are not rendered unless you turn that on"""
 
     bl_idname = "splannequin.add_splats"
     bl_label = "Add Frozen Splats"

@@ -47,7 +47,10 @@ class FreezePanel(step_panel.StepPanel):
             first, last = watch.state.frame_range
             if not first <= props.t_star <= last:
                 wrap(
-                    layout, context, f"Frame {props.t_star} is outside of the clip: it has {first} to {last}.", "ERROR"
+                    layout,
+                    context,
+                    f"Frame {props.t_star} is outside the clip, which has frames {first} to {last}.",
+                    "ERROR",
                 )
 
     def _suggested(self, context: bpy.types.Context) -> int | None:
@@ -152,7 +155,7 @@ class FreezePanel(step_panel.StepPanel):
             wrap(
                 layout,
                 context,
-                "Frozen frames are sharp throughout: the camera's depth of field is not in them.",
+                "Frozen frames are sharp throughout. They do not have the camera's depth of field.",
                 "INFO",
             )
 

@@ -45,7 +45,7 @@ class FreezeSettings:
 
     choose_t_star = BoolProperty(
         name="Choose the Instant",
-        description="Set the frame at which time stands still yourself; off: the best supported one is taken",
+        description="Choose the frame at which time stands still; off: use the frame with the best support",
         default=False,
         options=set(),
         update=_instant_chosen,
@@ -57,15 +57,16 @@ class FreezeSettings:
     )
     path_camera = PointerProperty(
         name="Camera",
-        description="Animated camera to see the frozen instant from; empty: the clip's own move",
+        description="Animated camera that views the frozen instant; empty: the camera move of the clip",
         type=bpy.types.Object,
         poll=lambda _, item: getattr(item, "type", "") == "CAMERA",
         options=set(),
     )
     motion_blur = BoolProperty(
         name="Motion Blur",
-        description="Blur the frames by the move of your camera, with the shutter of the scene's render settings. A "
-        "frame takes as many times as long as its blur is pixels long, 33 times at most",
+        description="Add motion blur from your camera move, with the shutter of the scene's render settings. "
+        "The render "
+        "time of a frame grows with the length of its blur in pixels, up to 33 times",
         default=False,
         options=set(),
     )
@@ -93,18 +94,23 @@ class FreezeSettings:
     )
     overscan = EnumProperty(
         name="Overscan",
-        description="Picture beyond the frame, for the way back into the original's lens distortion. The compositor "
-        "shows the frame as without it",
+        description="Image area beyond the frame, needed to restore the original's lens distortion. The "
+        "compositor still "
+        "shows only the frame",
         items=[
             ("OFF", "Off", "Frozen frames end where the plate ends"),
-            ("LENS", "What the Lens Needs", "As much more on every side as the original, distorted frame shows"),
-            ("PERCENT", "In Percent", "As much more on every side as you say, in percent of width and height"),
+            (
+                "LENS",
+                "What the Lens Needs",
+                "Extra image area on every side, as much as the original, distorted frame shows",
+            ),
+            ("PERCENT", "In Percent", "Extra image area on every side, in percent of width and height"),
         ],
         options=set(),
     )
     overscan_percent = FloatProperty(
         name="Percent",
-        description="Picture beyond the frame on every side, in percent of its width and height",
+        description="Image area beyond the frame on every side, in percent of the frame's width and height",
         default=10.0,
         min=0.0,
         max=100.0,
@@ -118,7 +124,7 @@ class FreezeSettings:
     )
     matte_mask = PointerProperty(
         name="Mask",
-        description="Mask drawn around a person or a thing in a frozen frame; the matte has its name",
+        description="Mask drawn around a person or an object in a frozen frame. The matte gets its name",
         type=bpy.types.Mask,
         options=set(),
     )

@@ -38,4 +38,4 @@ def show(scene: bpy.types.Scene, shot: Path, name: str, first: int, last: int) -
     for layer in scene.view_layers:
         if points is not None and points.name in layer.objects:
             points.hide_set(True, view_layer=layer)
-    return [f"The camera shows the frames of {name}; the points are hidden."]
+    return [f"The camera shows the frames of take {name}. The points are hidden."]

@@ -109,13 +109,13 @@ def reading(path: Path) -> Generator[job_timer.Progress, None, dict[str, np.ndar
         layout = np.dtype(fields)
         missing = [name for name in _NEEDED if name not in (layout.names or ())]
         if missing:
-            raise contract.UserError(f"{path}: not a 3D Gaussian PLY, the vertices have no {', '.join(missing[:4])}")
+            raise contract.UserError(f"{path} is not a 3D Gaussian PLY: its vertices have no {', '.join(missing[:4])}")
         parts: list[dict[str, np.ndarray]] = []
         for first in range(0, max(count, 1), CHUNK):
             wanted = min(CHUNK, count - first)
             rows = np.frombuffer(handle.read(wanted * layout.itemsize), dtype=np.uint8)
             if len(rows) < wanted * layout.itemsize:
-                raise contract.UserError(f"{path} is cut short: freeze again.")
+                raise contract.UserError(f"{path} is incomplete. Freeze again.")
             vertices = rows.view(layout)
             parts.append({name: vertices[name].astype(np.float32) for name in _NEEDED})
             done = first + wanted

@@ -66,11 +66,11 @@ class Freeze(Step):
         take = state.takes.get(settings_of(scene).take_name)
         if take is None:
             if own_camera.name_of(scene):
-                return View(False, True, [], "Render your camera's move with time standing still.")
+                return View(False, True, [], "Render your camera move with time standing still.")
             return View(False, True, [], "Render the clip's move with time standing still.")
         outdated, lines = takes.outdated(scene, take), _lines(state, take)
         if outdated:
-            return View(False, True, [outdated, *lines], "Freeze again to bring it up to date.")
+            return View(False, True, [outdated, *lines], "Freeze again to update the take.")
         verdict = contract.verdict_of(take)
         brief = verdict.word.capitalize() if verdict is not None else ""
         return View(True, True, lines, "", brief)
@@ -120,7 +120,7 @@ class Freeze(Step):
         """The reason why a run cannot be deleted: it is being scrubbed. Empty if it is not."""
         session = viewport.session()
         if session is not None and folder == contract.ShotFolder(shot).runs / session.run and session.shot == shot:
-            return "You are scrubbing through this run: stop scrubbing first"
+            return "You are scrubbing through this run. Stop scrubbing first."
         return ""
 
 
@@ -129,7 +129,7 @@ def _lines(state: ShotState, take: dict[str, Any]) -> list[str]:
     frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
     instant = f"Time stands still at frame {take['t_star_frame']}"
     if take["t_star_per_frame"]:
-        instant = "Time stands still as t* was keyed"
+        instant = "Time follows the keyframes of t*"
     across, down = take.get("margin", (0, 0))
     beyond = [f"Overscan: {across} pixels on each side, {down} above and below"] if across or down else []
     verdict = _new_verdict_lines(state, take)

@@ -13,8 +13,8 @@ from . import surfaces, takes
 
 
 class SPLANNEQUIN_OT_add_surface(takes.NeedsTake, step_operator.StepOperator, bpy.types.Operator):
-    """Make meshes of the chosen take's frozen room and people, and bring them into the scene under the shot's root.
-    They catch the shadows of what you place, hide what is behind them, and are seen in reflections"""
+    """Create meshes of the frozen room and people of the chosen take, and add them to the scene under the shot's root.
+    They catch the shadows of added objects, hide what is behind them and appear in reflections"""
 
     bl_idname = "splannequin.add_surface"
     bl_label = "Add Frozen Surface"

@@ -54,7 +54,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     corners = _corners(triangles)
     is_right = np.isin(triangles["corners"], 3).all() and (corners >= 0).all() and (corners < header.vertices).all()
     if not is_right or not all(np.isfinite(vertices[axis]).all() for axis in "xyz"):
-        raise contract.UserError(f"{path} is damaged: make it again.")
+        raise contract.UserError(f"{path} is damaged. Create it again.")
     return vertices, triangles
 
 

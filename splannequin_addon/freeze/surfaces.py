@@ -84,7 +84,7 @@ def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
     """take.json of a take whose surface can be added. Raises JobError, which names what is missing."""
     facts = inventory.read(shot).takes.get(take)
     if facts is None or not has_surface(shot, take):
-        raise contract.JobError(f"Take {take} has no surface.", "Make it first.", contract.ExitCode.USAGE)
+        raise contract.JobError(f"Take {take} has no surface.", "Create it first.", contract.ExitCode.USAGE)
     scene_objects.check_root(scene, shot)
     return facts
 

@@ -144,21 +144,25 @@ def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
     """
     params, camera = params_of(scene), own_camera.name_of(scene)
     if take["run"] != params.run:
-        return f"It was frozen from the run {take['run']}, now {params.run} is chosen."
+        return f"The take was frozen from the run {take['run']}, but {params.run} is chosen now."
     if bool(take["camera_path"]) != bool(camera):
-        return "It is seen from another camera than the one chosen now."
+        return "The take was frozen from a different camera than the one chosen now."
     ramp = {int(n): float(at) for n, at in take["t_star_per_frame"].items()}
     wanted = {int(n): at for n, at in params.t_star_per_frame.items()}
     if bool(ramp) != bool(wanted) or any(abs(ramp[n] - wanted[n]) > 1e-4 for n in ramp.keys() & wanted.keys()):
-        return "Its t* is not the one that is keyed now." if wanted else "Its t* was keyed, now it is not."
+        return (
+            "The take's t* keyframes differ from the current ones."
+            if wanted
+            else "The take was frozen with t* keyframes, but t* has none now."
+        )
     if not wanted and params.t_star not in (None, take["t_star_frame"], take["t_star_asked"]):
-        return f"Its t* is frame {take['t_star_frame']}, now frame {params.t_star} is chosen."
+        return f"The take's t* is frame {take['t_star_frame']}, but frame {params.t_star} is chosen now."
     if abs(take["overscan"] - params.overscan) > 1e-6:
-        return "Its overscan is not the one chosen now."
+        return "The take's overscan differs from the current setting."
     if abs(take["shutter"] - params.shutter) > 1e-3:
-        return "Its motion blur is not the one chosen now."
+        return "The take's motion blur differs from the current setting."
     missing = 0 if camera else take["frames_in_all"] - take["frame_count"]
-    return f"{missing} of its {take['frames_in_all']} frames are not rendered yet." if missing > 0 else ""
+    return f"{missing} of the take's {take['frames_in_all']} frames are not rendered yet." if missing > 0 else ""
 
 
 def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool:
@@ -249,6 +253,6 @@ def reading(
         return
     if selection.shot_folder(found) != shot:
         raise contract.JobError(
-            "Another shot was chosen while the camera was read.", "Choose this one and freeze again."
+            "Another shot was chosen while the camera was being read.", "Choose this shot and freeze again."
         )
     job_timer.follow(step, begin.begin(found, step, freeze_from(found, path, step)))

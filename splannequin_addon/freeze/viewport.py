@@ -125,10 +125,10 @@ def reason(scene: bpy.types.Scene) -> str:
         if one["frame"] == at:
             share, sharp = round(100 * one["seen"]), round(100 * one["sharpness"])
             if sharp == 100:
-                return f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, and is the sharpest."
+                return f"Suggestion {rank + 1}: frame {one['frame']} shows {share} % of what moves and is the sharpest."
             return (
-                f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, "
-                f"and is sharper than {sharp} % of the frames."
+                f"Suggestion {rank + 1}: frame {one['frame']} shows {share} % of what moves and is sharper than "
+                f"{sharp} % of the frames."
             )
     suggested = f"Suggested: {', '.join(str(one['frame']) for one in suggestions())}."
     return f"Shown: frame {shown.pop()}. " + suggested if len(shown) == 1 and at not in shown else suggested

@@ -71,8 +71,8 @@ def python() -> str:
                 break
         elif chosen:
             raise contract.JobError(
-                f"The backend's Python named in {where} does not exist: {path}.",
-                "Correct the path, or clear it to have the backend found by itself.",
+                f"The backend's Python set in {where} does not exist: {path}.",
+                "Correct the path, or clear it to detect the backend automatically.",
                 contract.ExitCode.ENVIRONMENT,
             )
     if wrong:
@@ -83,8 +83,8 @@ def python() -> str:
         )
     raise contract.JobError(
         "Splannequin's backend is not set up: no Python environment for it was found.",
-        "Press Set Up Backend in the add-on's preferences, or choose the Python of one that is there "
-        f"(or name it in {PYTHON_VARIABLE}).",
+        "Press Set Up Backend in the add-on's preferences, or choose the Python of an existing environment "
+        f"there (or set it in {PYTHON_VARIABLE}).",
         contract.ExitCode.ENVIRONMENT,
     )
 
@@ -93,9 +93,9 @@ def _environment_problem(python: Path) -> str:
     """Sentence why an interpreter's environment cannot be used; empty if it can."""
     folder = python.parent.parent
     if environment.is_incomplete(python):
-        return f"The backend's set-up has not finished: the environment in {folder} is half-made."
+        return f"The backend's set-up did not finish. The environment in {folder} is incomplete."
     changed = ", ".join(environment.changed(python))
-    return f"The backend in {folder} was changed since it was set up: {changed}." if changed else ""
+    return f"The backend in {folder} has changed since it was set up: {changed}." if changed else ""
 
 
 def trouble() -> contract.JobError | None:

@@ -55,9 +55,9 @@ def needed(scene: bpy.types.Scene, step: str) -> Path:
         raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
     if not steps.STEPS[step].makes_shot and not os.path.isfile(contract.ShotFolder(folder).info_path):
         if selection.missing(scene, None):
-            message, hint = f"The shot folder {folder} is not there any more.", "Press Locate and choose it."
+            message, hint = f"The shot folder {folder} no longer exists.", "Press Locate and choose it."
             raise contract.JobError(message, hint, contract.ExitCode.USAGE)
-        raise contract.JobError(f"{folder} is no shot folder.", steps.STEPS[step].needs, contract.ExitCode.USAGE)
+        raise contract.JobError(f"{folder} is not a shot folder.", steps.STEPS[step].needs, contract.ExitCode.USAGE)
     return folder
 
 
@@ -76,7 +76,7 @@ def remove_all(scene: bpy.types.Scene, shot: Path) -> list[str]:
     if markers.remove(scene):
         done.append("The marker t* was removed.")
     if scene_setup.restore(scene):
-        done.append("The scene's settings are as they were.")
+        done.append("The scene's settings were restored.")
     return done
 
 

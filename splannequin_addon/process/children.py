@@ -98,7 +98,7 @@ class Question:
         out, errors = self._printed
         if not self.process.returncode:
             return out
-        last = (errors.strip().splitlines() or ["the backend gave no reason"])[-1]
+        last = (errors.strip().splitlines() or ["no reason given"])[-1]
         known = self.process.returncode in {one.value for one in contract.ExitCode}
         if known and last.startswith("Error: ") and code is None:
             raise contract.JobError(last.removeprefix("Error: "), "", self.process.returncode)

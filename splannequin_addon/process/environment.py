@@ -134,7 +134,7 @@ def _why(setup: SetUp, code: int) -> str:
         error = str(contract.read_json(setup.summary).get("error", ""))
     except (OSError, ValueError):
         error = ""
-    return error or f"The set-up ended with exit code {code}: {' '.join(setup.output[-1:])}"
+    return error or f"The set-up failed with exit code {code}: {' '.join(setup.output[-1:])}"
 
 
 def cancel(setup: SetUp) -> None:
@@ -189,7 +189,7 @@ def remove(folder: Path, wait: bool = False) -> bool:
     if not environment.is_dir():
         return False
     if not (environment / contract.SETUP_NOTES).is_dir():
-        raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
+        raise ValueError(f"{environment} was not created by Splannequin")
     _require_unused(environment)
     # Rename first, so that no partly deleted folder counts as an environment after an interruption.
     renamed = folder / f"{_REMOVED}{uuid.uuid4().hex[:8]}"

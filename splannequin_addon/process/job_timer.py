@@ -293,7 +293,7 @@ def _follow_jobs() -> float:
             step, message = watch.running() or next(iter(steps.STEPS)), f"{type(error).__name__}: {error}"
             if watch.failures.get(step, ("",))[0] != message:  # print it once, not at every tick
                 traceback.print_exc()
-            watch.failures[step] = (message, "The console has the details.")
+            watch.failures[step] = (message, "See the console for details.")
             changed = True
     for turn in list(_callbacks):
         try:

@@ -193,7 +193,7 @@ def is_alive(job: Job, status: contract.Status | None) -> bool:
 def refuse_second_writer(shot: Path) -> None:
     """Raises JobError if a job writes into the shot or is about to.
 
-    For the holder of the lock, the message names the job, its start and its host.
+    The message names the job, its start and its host, if they are known.
     """
     try:
         writer = contract.read_writer(shot)
@@ -204,6 +204,11 @@ def refuse_second_writer(shot: Path) -> None:
     for job in latest(shot).values():
         is_local = job.status is None or job.status.host in ("", contract.computer_name())  # others hold the lock
         if is_local and not job.ended and is_alive(job, job.status):
+            if job.status is not None:
+                status = job.status
+                host, job_name = contract.computer_name(), job.folder.name
+                writer = contract.Writer(host, status.pid, status.process_started, job.kind, job_name, status.started)
+                raise contract.busy(shot, writer)
             raise contract.JobError(
                 f"A step of {shot.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
             )
@@ -438,14 +443,15 @@ def _mark_failed(job: Job, status: contract.Status | None) -> contract.Status:
     last = log_tail(job.folder, 1)
     status.state = "failed"
     status.exit_code = code if code is not None and code > 0 else int(contract.ExitCode.INTERNAL)
-    status.message = f"The backend stopped without a word during {status.stage or 'the start'}{how}."
+    status.message = f"The backend stopped unexpectedly during {status.stage or 'the start'}{how}."
     if last:
         status.message += f" Last line of its log: {last[0].strip()[:200]}"
     killed = code is not None and code < 0
     status.hint = (
-        "It was killed, perhaps for want of memory: close other programs or choose a smaller preset, then start again."
+        "The process was killed, possibly because memory ran out. Close other programs or choose a smaller "
+        "preset, then start again."
         if killed
-        else f"Start it again: finished work is kept. Its whole log is {job.folder / contract.LOG_FILE}"
+        else f"Start the step again. Finished work is kept. The full log is {job.folder / contract.LOG_FILE}"
     )
     return _keep(job, status)
 
@@ -475,10 +481,10 @@ def _kill(job: Job) -> None:
         status = job.status
         if status is None or status.host not in ("", contract.computer_name()):
             where = status.host.partition(" (")[0] if status else "another computer"
-            raise _not_ours(f"This step runs on {where}: only there it can be ended.")
+            raise _not_ours(f"This step runs on {where} and can only be ended there.")
         pid = status.pid
         if not contract.runs_job(pid, status.process_started, job.folder):
-            raise _not_ours("The process of this step cannot be told from others for sure, so none was ended.")
+            raise _not_ours("The process of this step could not be identified, so no process was ended.")
     if sys.platform == "win32":
         program = os.path.join(os.environ.get("SYSTEMROOT", r"C:\Windows"), "System32", "taskkill.exe")
         words = [program, "/F", "/T", "/PID", str(pid)]
@@ -495,6 +501,6 @@ def _kill(job: Job) -> None:
 
 def _not_ours(message: str) -> contract.JobError:
     return contract.JobError(
-        message, "It was asked to stop and does so with its next step, or end it where it was started.",
+        message, "The step will stop as soon as it can. Otherwise end it where it was started.",
         contract.ExitCode.USAGE,
     )  # fmt: skip

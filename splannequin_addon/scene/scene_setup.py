@@ -74,7 +74,7 @@ def fit_clip(
         changes.append(f"Resolution set to {size[0]} x {size[1]}.")
     if (render.pixel_aspect_x, render.pixel_aspect_y) != aspect and "pixel_aspect_x" not in excluded:
         _set(scene, "render", {"pixel_aspect_x": aspect[0], "pixel_aspect_y": aspect[1]})
-        changes.append("Pixel aspect set to the lens's.")
+        changes.append("Pixel aspect set to match the lens.")
     if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4 and "fps" not in excluded:
         whole = max(round(fps), 1)
         _set(scene, "render", {"fps": whole, "fps_base": whole / fps})
@@ -144,7 +144,7 @@ def note(scene: bpy.types.Scene, text: str) -> list[str]:
     if text == now and render.use_stamp_note == bool(text):
         return []
     _set(scene, "render", {"use_stamp_note": bool(text), "stamp_note_text": text})
-    return [f"What is rendered says in its metadata (Note): {text}"] if text else []
+    return [f"Note in the metadata of rendered images: {text}"] if text else []
 
 
 def _neutral(view: Any) -> str:
@@ -159,8 +159,8 @@ def _neutral(view: Any) -> str:
         if name in NEUTRAL_VIEWS:
             return name
     raise contract.JobError(
-        f"This Blender's colour configuration has no view that leaves colours alone ({', '.join(NEUTRAL_VIEWS)}).",
-        "Use Blender's own configuration, or switch Keep Plate Colours off.",
+        f"Blender's colour configuration has no view that keeps colours unchanged ({', '.join(NEUTRAL_VIEWS)}).",
+        "Use Blender's default configuration, or turn Keep Plate Colours off.",
         contract.ExitCode.BAKE,
     )
 

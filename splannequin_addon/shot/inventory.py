@@ -163,7 +163,7 @@ def floor(shot: Path) -> tuple[list[float], float] | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         normal, height = [], 0.0
     if len(normal) != 3 or not all(map(math.isfinite, (*normal, height))):
-        raise ValueError(f"{file} is damaged: solve again.")
+        raise ValueError(f"{file} is damaged. Solve again.")
     return normal, height
 
 

@@ -54,8 +54,8 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
     except (OSError, ValueError, KeyError) as error:
         raise contract.JobError(f"{folder} cannot be read: {error}", "", contract.ExitCode.USAGE) from error
     if not state.info:
-        hint = "Choose the folder that holds shot.json; its name ends with .splannequin unless it was renamed."
-        raise contract.JobError(f"{folder} is no shot folder.", hint, contract.ExitCode.USAGE)
+        hint = "Choose the folder that contains shot.json. Its name ends with .splannequin unless it was renamed."
+        raise contract.JobError(f"{folder} is not a shot folder.", hint, contract.ExitCode.USAGE)
     props, before = settings_of(scene), selection.folder_of(settings_of(scene))
     entry = scene_objects.of(scene, before) if before is not None else None
     if entry is not None and scene_objects.of(scene, folder) in (None, entry):

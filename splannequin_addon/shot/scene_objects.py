@@ -35,8 +35,8 @@ class SPLANNEQUIN_PG_surface(bpy.types.PropertyGroup):
 class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     """What there is of one shot; its name is the shot's."""
 
-    folder = StringProperty(name="Folder", description="Shot folder that it was made from", options=set())
-    root = PointerProperty(name="Root", description="Where the solve stands in the scene", type=bpy.types.Object)
+    folder = StringProperty(name="Folder", description="Shot folder that the data comes from", options=set())
+    root = PointerProperty(name="Root", description="Object that places the solve in the scene", type=bpy.types.Object)
     camera = PointerProperty(name="Camera", description="The solved camera", type=bpy.types.Object)
     points = PointerProperty(name="Points", description="The sparse points", type=bpy.types.Object)
     plate = PointerProperty(
@@ -44,29 +44,31 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     )
     world = StringProperty(
         name="World",
-        description="What the coordinates of the loaded solve are: scene, or empty for a world of its own",
+        description="Coordinate system of the loaded solve: scene, or empty for a separate one",
         options={"HIDDEN"},
     )
-    scaled = BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
+    scaled = BoolProperty(
+        name="Scaled", description="The scale of the shot was set from a known distance", options=set()
+    )
     guessed_scale = FloatProperty(
-        name="Guessed Scale",
-        description="Scene units per solve unit that the camera's height suggested; 0: none was guessed",
+        name="Estimated Scale",
+        description="Scene units per solve unit, estimated from the camera's height; 0: no estimate",
         options={"HIDDEN"},
     )
     splats = CollectionProperty(name="Splats", description="Splats of takes", type=SPLANNEQUIN_PG_splats, options=set())
     surfaces = CollectionProperty(
         name="Surfaces", description="Surfaces of takes", type=SPLANNEQUIN_PG_surface, options=set()
     )
-    light = PointerProperty(
-        name="Light", description="The world that lights the scene as the shot does", type=bpy.types.World
+    light = PointerProperty(name="Light", description="World that lights the scene like the shot", type=bpy.types.World)
+    collection = PointerProperty(
+        name="Collection", description="Collection that contains these objects", type=bpy.types.Collection
     )
-    collection = PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
     points_hidden_in = StringProperty(
         name="Points Hidden In",
         description="View layers in which scrubbing hid the points, as JSON",
         options={"HIDDEN"},
     )
-    marks = StringProperty(name="Marks", description="Markers that were put on the timeline, as JSON", options=set())
+    marks = StringProperty(name="Marks", description="Markers that were added to the timeline, as JSON", options=set())
 
 
 def name_of(shot: Path) -> str:
@@ -201,7 +203,7 @@ def needed_scene(scene_uid: int) -> bpy.types.Scene:
     """The scene with this number. Raises JobError if it no longer exists."""
     scene = session.scene_of(scene_uid)
     if scene is None:
-        raise contract.JobError("The scene is not there any more.", "", contract.ExitCode.USAGE)
+        raise contract.JobError("The scene no longer exists.", "", contract.ExitCode.USAGE)
     return scene
 
 

@@ -96,7 +96,7 @@ def evaluated(
     seen = camera.evaluated_get(graph)
     if not seen.is_evaluated:
         raise contract.JobError(
-            f"{camera.name} does not move: it is disabled in viewports, or its collection is excluded.",
+            f"{camera.name} does not move, because it is disabled in viewports or its collection is excluded.",
             "Enable it in the Outliner, or make it the scene's camera.",
             contract.ExitCode.USAGE,
         )

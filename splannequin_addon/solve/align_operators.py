@@ -91,7 +91,7 @@ class _Aligns(OperatorBase):
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         """Tooltip of the button for selected objects."""
-        return "The same from the places of the selected objects, such as empties" if properties.selected else ""
+        return tr("Use the locations of selected objects, such as empties") if properties.selected else ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Starts the clicking, unless `places` is set or selected objects are used."""
@@ -111,11 +111,11 @@ class _Aligns(OperatorBase):
             notes = scale.move(scene, shot, self.change(scene, shot, self._places(context, shot)))
         except (contract.JobError, OSError, ValueError) as error:
             message = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
-            self.report({"ERROR"}, message)
+            self.report({"ERROR"}, tr(message))
             return {"CANCELLED"}
         job_timer.watch_of(shot).notes["solve"] = notes
         for note in notes:
-            self.report({"INFO"}, note)
+            self.report({"INFO"}, tr(note))
         return {"FINISHED"}
 
     def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
@@ -142,7 +142,7 @@ class _Aligns(OperatorBase):
         cloud = cameras.find(scene, shot, "MESH")
         xyz = points.coloured(mesh_of(cloud))[0] if cloud is not None else np.zeros((0, 3), np.float32)
         if bpy.app.background or not len(xyz):
-            message = "There are no points to click: select objects that stand where they should be"
+            message = "There are no points to click. Select objects at the positions of the points"
             self.report({"ERROR"}, message)
             return {"CANCELLED"}
         stop()
@@ -185,7 +185,7 @@ class _Aligns(OperatorBase):
         if event.type == "MOUSEMOVE" or view is None:
             return {"PASS_THROUGH"}
         if under < 0:
-            self.report({"INFO"}, "No point of the solve is there")
+            self.report({"INFO"}, "There is no point of the solve at this position")
             return {"RUNNING_MODAL"}
         if under not in picked.picked:
             picked.picked.append(under)
@@ -214,13 +214,14 @@ class _Aligns(OperatorBase):
         if _picking is None:
             return
         done = f"{len(_picking.picked)} of {_picking.wanted}"
-        context.workspace.status_text_set(f"{self.prompt}: {done}.  Backspace: one back.  Esc: cancel")
+        text = tr(f"{self.prompt}: {done}.  Backspace: remove the last point.  Esc: cancel")
+        context.workspace.status_text_set(text)
         _redraw(context.window)
 
 
 _SELECTED = BoolProperty(
     name="Selected Objects",
-    description="Take the places of the selected objects instead of clicks",
+    description="Use the locations of the selected objects instead of clicked points",
     default=False,
     options={"SKIP_SAVE", "HIDDEN"},
 )
@@ -229,20 +230,21 @@ _SELECTED = BoolProperty(
 def _places_property(count: int) -> list[float]:
     return FloatVectorProperty(
         name="Points",
-        description="Places of the points in the scene, one after the other",
+        description="Coordinates of the points in the scene, one after the other",
         size=3 * count,
         options={"SKIP_SAVE", "HIDDEN"},
     )
 
 
 class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
-    """Click three points of the floor: the solve is turned and moved until they lie at height 0, the camera above"""
+    """Click three points on the floor. The solve is rotated and moved so that they lie at height 0, with the camera
+    above"""
 
     bl_idname = "splannequin.align_floor"
     bl_label = "Floor from Three Points"
     bl_options = {"REGISTER", "UNDO"}
     count = 3
-    prompt = "Click three points of the floor"
+    prompt = "Click three points on the floor"
 
     places = _places_property(3)
     selected = _SELECTED
@@ -253,13 +255,13 @@ class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
-    """Click a point: the solve is moved until it lies at the scene's origin"""
+    """Click a point. The solve is moved so that the point lies at the scene's origin"""
 
     bl_idname = "splannequin.align_origin"
     bl_label = "Set Origin"
     bl_options = {"REGISTER", "UNDO"}
     count = 1
-    prompt = "Click the point that is to be the origin"
+    prompt = "Click the point for the origin"
 
     places = _places_property(1)
     selected = _SELECTED
@@ -270,19 +272,19 @@ class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
-    """Click two points and say how far apart they are: the solve is scaled about the scene's origin until it is so"""
+    """Click two points and enter their distance. The solve is scaled about the scene's origin to match it"""
 
     bl_idname = "splannequin.align_scale"
     bl_label = "Set Scale"
     bl_options = {"REGISTER", "UNDO"}
     count = 2
-    prompt = "Click two points whose distance you know"
+    prompt = "Click two points with a known distance"
 
     places = _places_property(2)
     selected = _SELECTED
     distance = FloatProperty(
         name="Distance",
-        description="How far apart the two points are",
+        description="Distance between the two points",
         default=1.0,
         min=1e-6,
         soft_max=1000.0,

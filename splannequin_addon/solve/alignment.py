@@ -60,7 +60,7 @@ def level(places: Floats, centres: Floats, ups: Floats) -> NDArray[np.float64]:
     normal = np.cross(first, second)
     longest = max(_length(first), _length(second), _length(second - first))
     if _length(normal) <= FLATTEST * longest * longest:
-        raise JobError("The three points lie on one line.", "Choose three that span the floor.", ExitCode.USAGE)
+        raise JobError("The three points lie on one line.", "Choose three points that span the floor.", ExitCode.USAGE)
     normal = unit(normal)
     above = float(((centres - places[0]) @ normal).mean())
     if abs(above) < 1e-3 * longest:
@@ -89,9 +89,9 @@ def scaled(places: Floats, distance: float) -> NDArray[np.float64]:
     places = np.asarray(places, dtype=np.float64)
     now = _length(places[1] - places[0])
     if not (distance > 0 and np.isfinite(distance)):
-        raise JobError("The distance has to be above 0.", "Say how far apart the points are.", ExitCode.USAGE)
+        raise JobError("The distance must be greater than 0.", "Enter the distance between the points.", ExitCode.USAGE)
     if now <= 1e-9 * max(1.0, float(np.abs(places).max())):
-        raise JobError("The two points are the same.", "Choose two that are apart.", ExitCode.USAGE)
+        raise JobError("The two points are at the same position.", "Choose two different points.", ExitCode.USAGE)
     return np.diag([distance / now] * 3 + [1.0])
 
 

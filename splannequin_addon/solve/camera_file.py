@@ -79,7 +79,7 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
         return children.Question(children.start(placed, backend.package_root(), outlives=False, **piped))
     except OSError as error:
         raise contract.JobError(
-            f"No second Blender could be started to read {file.name}: {error}.",
+            f"A second Blender could not be started to read {file.name}: {error}.",
             "Import the file, and choose Scene Camera.",
             contract.ExitCode.ENVIRONMENT,
         ) from error
@@ -112,7 +112,7 @@ def main(words: str) -> int:
         print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
         return error.exit_code
     except OSError as error:
-        known = inventory.unwritable(Path(wanted["shot"]), error, "Is the disk full?")
+        known = inventory.unwritable(Path(wanted["shot"]), error, "Make sure that the disk is not full.")
         print(f"Error: {known.message} {known.hint}".rstrip(), file=sys.stderr)
         return known.exit_code
     return contract.ExitCode.OK
@@ -144,7 +144,7 @@ def read(scene: bpy.types.Scene, file: Path, size: tuple[int, int]) -> dict[str,
     _import(file)
     cameras = sorted((o for o in scene.objects if o.type == "CAMERA"), key=lambda o: o.name)
     if not cameras:
-        raise contract.JobError(f"{file.name} holds no camera.", "Choose another file.", contract.ExitCode.SOLVE)
+        raise contract.JobError(f"{file.name} contains no camera.", "Choose another file.", contract.ExitCode.SOLVE)
     for camera in [c for c in cameras if camera_of(c).type == "PERSP"]:
         data = camera_of(camera)
         if data.sensor_fit == "AUTO":  # files store the film back, whose width is the images' width
@@ -193,7 +193,7 @@ def _choice(file: Path, camera: bpy.types.Object, count: int) -> list[tuple[str,
         return []
     return [
         (
-            f"{file.name} holds {count} cameras: {camera.name} was taken, the first that moves.",
+            f"{file.name} contains {count} cameras. {camera.name} was used, the first that moves.",
             "For another one import the file, and choose Scene Camera.",
         )
     ]
@@ -210,8 +210,9 @@ def _film_back(
     film = f"{data.sensor_width:.4g} x {data.sensor_height:.4g} mm"
     return [
         (
-            f"The film back of {camera.name} in {file.name} is {film}, another shape than the clip's frames.",
-            "Its width was taken for theirs.",
+            f"The film back of {camera.name} in {file.name} is {film}, which is a different aspect ratio than the "
+            "clip's frames.",
+            "The width of the film back was used.",
         )
     ]
 
@@ -240,7 +241,9 @@ def _refused(file: Path, message: str) -> contract.JobError:
         next((line for line in message.splitlines() if line.strip()), "").removeprefix("Error: ").strip().rstrip(".")
     )
     why = (
-        contract.printable(first, 200) if first and "Traceback" not in first else "it is damaged, or of another format"
+        contract.printable(first, 200)
+        if first and "Traceback" not in first
+        else "it is damaged or has an unsupported format"
     )
     return contract.JobError(
         f"Blender could not read {file.name}: {why}.",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import bpy
     from mathutils import Matrix
 
-MOVING_CAMERA_HINT = "Choose a camera that moves as the clip's did."
+MOVING_CAMERA_HINT = "Choose a camera that moves like the clip's camera."
 """Hint for a camera that cannot be the clip's."""
 _STILL = 1e-6
 """Largest change in a still camera's matrix elements, relative to its position, because Blender's matrices are

@@ -337,9 +337,9 @@ def points_of(shot: Path) -> tuple[np.ndarray, np.ndarray]:
     except contract.UnreadableFile:
         raise
     except ValueError as error:
-        raise contract.UserError(f"{file} is damaged: solve again.") from error
+        raise contract.UserError(f"{file} is damaged. Solve again.") from error
     if xyz.shape != rgb.shape or xyz.shape[1:] != (3,) or not np.isfinite(xyz).all():
-        raise contract.UserError(f"{file} is damaged: solve again.")
+        raise contract.UserError(f"{file} is damaged. Solve again.")
     return xyz, rgb
 
 

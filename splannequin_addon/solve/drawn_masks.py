@@ -96,7 +96,7 @@ def _render_one(mask_uid: int, name: str, size: tuple[int, int], file: Path, fra
     written."""
     mask = session.of(bpy.data.masks, mask_uid)
     if mask is None:
-        raise contract.JobError(f"The mask {name} is gone.", "Choose another mask.", contract.ExitCode.USAGE)
+        raise contract.JobError(f"The mask {name} no longer exists.", "Choose another mask.", contract.ExitCode.USAGE)
     with _stage(mask, size) as scene:
         scene.frame_set(frame)
         scene.render.filepath = str(file)
@@ -104,7 +104,7 @@ def _render_one(mask_uid: int, name: str, size: tuple[int, int], file: Path, fra
     if not file.is_file():
         raise contract.JobError(
             f"The mask {name} was not written to {file}.",
-            "Make room, or see to it that the shot's folder can be written.",
+            "Free disk space, or make sure that the shot folder is writable.",
             contract.ExitCode.DISK,
         )
 

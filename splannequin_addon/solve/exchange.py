@@ -205,7 +205,7 @@ def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:
     values = {name: float(getattr(camera, name, 0.0)) for name in bend}
     if model != "POLYNOMIAL" and (not bend or any(values.values())):
         raise contract.JobError(
-            f"The lens of {clip.name} has the distortion model {model.title()}, which cannot be handed on.",
+            f"The lens of {clip.name} uses the distortion model {model.title()}, which is not supported.",
             "Set it to Polynomial in the Movie Clip editor and solve its camera again.",
             contract.ExitCode.USAGE,
         )

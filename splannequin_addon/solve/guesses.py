@@ -79,7 +79,7 @@ def sentence(result: dict[str, Any]) -> str:
     guessed, total = result.get("interpolated", 0), result.get("frames", 0)
     if not guessed:
         return ""
-    return f"{guessed} of {total} frames have a guessed camera: pink keys on the timeline."
+    return f"{guessed} of {total} frames have a guessed camera, shown as pink keys on the timeline."
 
 
 def solved(shot: Path, path: contract.CameraPath) -> set[int]:

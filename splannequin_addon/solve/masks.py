@@ -56,6 +56,6 @@ def _source(scene: bpy.types.Scene, shot: Path | None, kind: str, rendered: bool
         return str(contract.ShotFolder(shot).drawn_masks(kind) if rendered else drawn_masks.render(mask, shot, kind))
     raise contract.JobError(
         f"Nothing is chosen for the mask {LABELS[kind]}.",
-        "Choose a picture, a sequence, a video or a drawn mask, or set the mask to None.",
+        "Choose an image, a sequence, a video or a drawn mask, or set the mask to None.",
         contract.ExitCode.USAGE,
     )

@@ -66,8 +66,7 @@ class _Matte(OperatorBase):
 
 
 class SPLANNEQUIN_OT_show_motion(_Matte, bpy.types.Operator):
-    """Show in an Image Editor what the solve found to move by itself: black stands still, white moves, grey is not
-    known"""
+    """Show the motion matte from the solve in an Image Editor: black stands still, white moves, grey is unknown"""
 
     bl_idname = "splannequin.show_motion"
     bl_label = "Show Motion"
@@ -83,7 +82,8 @@ class SPLANNEQUIN_OT_show_motion(_Matte, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_motion_over_plate(_Matte, bpy.types.Operator):
-    """Tint what the solve found to move over the plate, seen through the solved camera; pressed again: no more"""
+    """Tint the moving areas found by the solve over the plate, seen through the solved camera. Press again to turn the
+    tint off"""
 
     bl_idname = "splannequin.motion_over_plate"
     bl_label = "Motion over Plate"
@@ -94,7 +94,7 @@ class SPLANNEQUIN_OT_motion_over_plate(_Matte, bpy.types.Operator):
         step."""
         scene = scene_in(context)
         if motion_overlay.hide(scene, shot):
-            return "The plate is shown as it is."
+            return "The plate is shown without the tint."
         turns = mattes.tint_in_turns(shot)
         first = next(turns, None)
         if first is None or bpy.app.background:
@@ -102,7 +102,7 @@ class SPLANNEQUIN_OT_motion_over_plate(_Matte, bpy.types.Operator):
                 pass
             return " ".join(mattes.show_over_plate(scene, shot))
         job_timer.work(shot, "solve", _tint(shot, turns, scene.session_uid))
-        return "The mattes are tinted."
+        return "Tinting the motion."
 
 
 def _tint(shot: Path, turns: Iterator[tuple[int, int]], scene_uid: int) -> Iterator[job_timer.Progress]:
@@ -115,8 +115,7 @@ def _tint(shot: Path, turns: Iterator[tuple[int, int]], scene_uid: int) -> Itera
 
 
 class SPLANNEQUIN_OT_paint_motion(_Matte, bpy.types.Operator):
-    """Paint over the motion matte of the current frame in an Image Editor: black where it stands still, white where it
-    moves"""
+    """Paint on the motion matte of the current frame in an Image Editor: black stands still, white moves"""
 
     bl_idname = "splannequin.paint_motion"
     bl_label = "Paint Motion"
@@ -130,7 +129,7 @@ class SPLANNEQUIN_OT_paint_motion(_Matte, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_save_motion(_Matte, bpy.types.Operator):
-    """Keep what was painted on the motion matte of the current frame in the shot: freezes from now on follow it"""
+    """Save the painted motion matte of the current frame in the shot. Later freezes use it"""
 
     bl_idname = "splannequin.save_motion"
     bl_label = "Save Motion Paint"
@@ -144,12 +143,12 @@ class SPLANNEQUIN_OT_save_motion(_Matte, bpy.types.Operator):
             message = f"Nothing is painted on frame {frame}."
             raise contract.JobError(message, "Press Paint Motion first.", contract.ExitCode.USAGE)
         mattes.save_paint(image)
-        return f"Frame {frame} of the motion matte is as you painted it."
+        return f"Frame {frame} uses your painted motion matte."
 
 
 class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
-    """Delete what was painted on the motion matte of the current frame from the shot folder on disk, after a question:
-    what the solve found holds again"""
+    """Delete the painted motion matte of the current frame from the shot folder on disk, after confirmation. The matte
+    from the solve is used again"""
 
     bl_idname = "splannequin.clear_motion"
     bl_label = "Clear Motion Paint"
@@ -159,7 +158,8 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
         """Asks for confirmation, because undo does not restore deleted files."""
         return context.window_manager.invoke_confirm(
             self, event, title="Delete the painted matte of this frame from disk?",
-            message="What the solve found holds again. This cannot be undone.", confirm_text="Remove", icon="WARNING",
+            message="The matte from the solve is used again. This cannot be undone.", confirm_text="Remove",
+            icon="WARNING",
         )  # fmt: skip
 
     def act(self, context: bpy.types.Context, shot: Path) -> str:
@@ -169,11 +169,11 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
             gone = mattes.clear_paint(shot, frame)
         except OSError as error:
             raise inventory.unwritable(
-                mattes.painted_file(shot, frame), error, "Close it elsewhere, then try again."
+                mattes.painted_file(shot, frame), error, "Close it in other programs, then try again."
             ) from error
         if not gone:
             raise contract.JobError(f"Nothing is painted on frame {frame}.", "", contract.ExitCode.USAGE)
-        return f"Frame {frame} of the motion matte is as the solve found it."
+        return f"Frame {frame} uses the motion matte from the solve."
 
 
 def draw(layout: bpy.types.UILayout, is_over_plate: bool) -> None:

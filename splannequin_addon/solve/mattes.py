@@ -61,8 +61,8 @@ def load_sequence(shot: Path) -> tuple[Any, int, int]:
 
 def no_matte(shot: Path) -> contract.JobError:
     """The error for a shot that was solved before mattes existed."""
-    message = f"{scene_objects.name_of(shot)} has no motion matte here."
-    return contract.JobError(message, "Solve the camera again: its last part finds it.", contract.ExitCode.USAGE)
+    message = f"{scene_objects.name_of(shot)} has no motion matte."
+    return contract.JobError(message, "Solve the camera again to create it.", contract.ExitCode.USAGE)
 
 
 def paint_image(shot: Path, frame: int) -> bpy.types.Image:
@@ -152,7 +152,7 @@ def save_paint(image: bpy.types.Image) -> Path:
     """
     known = _of(image)
     if known is None:
-        message = f"{image.name} is no motion matte."
+        message = f"{image.name} is not a motion matte."
         raise contract.JobError(message, "Press Paint Motion first.", contract.ExitCode.USAGE)
     path = painted_file(Path(known[0]), known[1])
     width, height = size_of(image)
@@ -163,7 +163,7 @@ def save_paint(image: bpy.types.Image) -> Path:
         write(path, data)
     except OSError as error:
         raise inventory.unwritable(
-            path, error, "Make room, or see to it that the shot's folder can be written."
+            path, error, "Free disk space, or make sure that the shot folder is writable."
         ) from error
     image.filepath_raw, image.file_format = paths.blend_path(path), "PNG"
     image.source = "FILE"
@@ -208,8 +208,8 @@ def _pixels(path: Path) -> np.ndarray:
     """Stored values of an image file, [H, W, 4] float32, bottom row first. Raises JobError if it cannot be read."""
     announced = contract.png_size(path)
     if announced[0] * announced[1] > contract.MOST_PIXELS:  # Blender would try to allocate all of it
-        message = f"{path} is {announced[0]} x {announced[1]} pixels, or says so."
-        raise contract.JobError(message, "Remove it, or make it smaller.", contract.ExitCode.USAGE)
+        message = f"{path} has {announced[0]} x {announced[1]} pixels according to its header."
+        raise contract.JobError(message, "Remove or shrink it.", contract.ExitCode.USAGE)
     image = bpy.data.images.load(contract.regular_file(path))
     try:
         image.alpha_mode = "CHANNEL_PACKED"  # no premultiplication
@@ -259,7 +259,7 @@ def tint_in_turns(shot: Path) -> Iterator[tuple[int, int]]:
             write(folder / contract.frame_file(number, contract.PICTURE), data)
         except OSError as error:
             raise inventory.unwritable(
-                folder, error, "Make room, or see to it that the shot's folder can be written."
+                folder, error, "Free disk space, or make sure that the shot folder is writable."
             ) from error
 
 
@@ -296,7 +296,7 @@ def show_over_plate(scene: bpy.types.Scene, shot: Path) -> list[str]:
     sequences.show_sequence(background.image_user, image, numbers[0], numbers[-1])
     background.frame_method, background.display_depth, background.alpha = "FIT", "FRONT", 1.0
     data.show_background_images = True
-    return ["What moves is tinted over the plate: orange moves, blue is not known."]
+    return ["The motion is tinted over the plate: orange moves, blue is unknown."]
 
 
 def _is_newer(file: Path, shot: Path, number: int) -> bool:

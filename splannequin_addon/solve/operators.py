@@ -19,12 +19,16 @@ from . import arrival, exchange, stmaps
 
 FORMATS = [
     ("colmap", "COLMAP", "Cameras, images and points3D as .bin, of the plates in the shot's folder frames"),
-    ("colmap_text", "COLMAP Text", "The same as .txt"),
+    ("colmap_text", "COLMAP Text", "The same files as .txt"),
     ("nerfstudio", "nerfstudio", "A transforms.json that points to the plates, and points.ply"),
     ("chan", "Nuke Chan", "The animated camera as a table, in the scene's units and Nuke's axes: camera.chan"),
     ("nk", "Nuke Script", "The animated camera with its lens as nodes to paste, in Nuke's axes: camera.nk"),
-    ("ply", "Splats", "The splats of the chosen take, where this scene has the shot: frozen.ply"),
-    ("usd", "USD", "The splats of the chosen take and the animated camera, where this scene has the shot: frozen.usdc"),
+    ("ply", "Splats", "The splats of the chosen take, placed as the shot is in this scene: frozen.ply"),
+    (
+        "usd",
+        "USD",
+        "The splats of the chosen take and the animated camera, placed as the shot is in this scene: frozen.usdc",
+    ),
 ]
 
 
@@ -62,7 +66,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
         """Starts the export in the backend. With a window, the panel reports when it is done."""
         shot = selection.shot_folder(scene_in(context))
         if shot is None or not self.directory:
-            self.report({"ERROR"}, "No folder was given")
+            self.report({"ERROR"}, "No folder is chosen")
             return {"CANCELLED"}
         folder = Path(os.path.abspath(bpy.path.abspath(self.directory)))
         kind, _, text = self.format.partition("_")
@@ -72,14 +76,14 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
             placement.write(scene_in(context), shot)
             question = exchange.begin_export(words)
             if bpy.app.background:
-                self.report({"INFO"}, exchange.exported(question, folder))
+                self.report({"INFO"}, tr(exchange.exported(question, folder)))
                 return {"FINISHED"}
         except contract.JobError as error:
-            self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}
         except OSError as error:
-            refusal = inventory.unwritable(shot, error, "Is the disk full, or the shot on a disk that is read only?")
-            self.report({"ERROR"}, f"{refusal.message} {refusal.hint}".strip())
+            refusal = inventory.unwritable(shot, error, "Make sure that the disk is not full or read-only.")
+            self.report({"ERROR"}, tr(f"{refusal.message} {refusal.hint}".strip()))
             return {"CANCELLED"}
         job_timer.watch_of(shot).failures.pop("solve", None)
         job_timer.when_answered(question, lambda: tell(shot, lambda: [exchange.exported(question, folder)]))
@@ -87,7 +91,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_solve_camera(step_operator.StepOperator, bpy.types.Operator):
-    """Find where the camera was on every frame, and bring it in as an animated camera with the plate behind it"""
+    """Find where the camera was on every frame, and add it as an animated camera with the plate behind it"""
 
     bl_idname = "splannequin.solve_camera"
     bl_label = "Solve Camera"
@@ -106,7 +110,7 @@ class SPLANNEQUIN_OT_solve_camera(step_operator.StepOperator, bpy.types.Operator
 
 
 class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
-    """Bring the solved camera, its plate and the points into this scene, in place of an earlier solve of this shot"""
+    """Load the solved camera, its plate and the points into this scene. Replaces an earlier solve of this shot"""
 
     bl_idname = "splannequin.load_camera"
     bl_label = "Load Camera"
@@ -121,15 +125,15 @@ class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
-    """Write two ST maps into the shot's solve folder: one takes the original's lens distortion out, the other puts it
-    back onto what you made over the undistorted plate"""
+    """Write two ST maps into the shot's solve folder: one removes the original's lens distortion, the other applies it
+    to work done over the undistorted plate"""
 
     bl_idname = "splannequin.write_stmaps"
     bl_label = "Write ST Maps"
     bl_options = {"REGISTER"}
 
     width = IntProperty(
-        name="Width", description="Width of the maps in pixels; 0: that of the working frames", default=0, min=0
+        name="Width", description="Width of the maps in pixels; 0: width of the working frames", default=0, min=0
     )
 
     @classmethod
@@ -156,7 +160,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         try:
             question = stmaps.begin(folder, self.width)
         except contract.JobError as error:
-            self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}
         watch = job_timer.watch_of(folder)
         watch.failures.pop("solve", None)
@@ -167,10 +171,10 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         question.wait()
         tell(folder, lambda: stmaps.sentences(stmaps.answer(question)))
         if "solve" in watch.failures:
-            self.report({"ERROR"}, watch.failures["solve"][0])
+            self.report({"ERROR"}, tr(watch.failures["solve"][0]))
             return {"CANCELLED"}
         for line in watch.notes["solve"]:
-            self.report({"INFO"}, line)
+            self.report({"INFO"}, tr(line))
         return {"FINISHED"}
 
 

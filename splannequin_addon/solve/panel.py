@@ -41,9 +41,9 @@ class SolvePanel(step_panel.StepPanel):
             return
         if not scale.scaled(scene_in(context), watch.shot):
             if scale.guessed_scale(scene_in(context), watch.shot):
-                wrap(layout, context, "The scale is a guess from the camera's height.", "INFO")
+                wrap(layout, context, "The scale is estimated from the camera's height.", "INFO")
             else:
-                wrap(layout, context, "The scale is arbitrary. Set it if you need real units.", "INFO")
+                wrap(layout, context, "The scale is arbitrary. Set it if you need real-world units.", "INFO")
             layout.operator("splannequin.align_scale", icon=icons.of("splannequin.align_scale")).selected = False
         body = step_panel.sub_panel(layout, "camera_alignment", "Alignment")
         if body is not None:
@@ -80,11 +80,11 @@ class SolvePanel(step_panel.StepPanel):
         scene = scene_in(context)
         props, shot = settings_of(scene), selection.shot_folder(scene)
         if props.ignore_from in ("NONE", "FOUND") and shot is not None and inventory.burnt_in(shot) is not None:
-            wrap(layout, context, "Something is burnt into the clip: a logo, a caption.", "INFO")
+            wrap(layout, context, "The clip has a burnt-in logo or caption.", "INFO")
             if props.ignore_from == "FOUND":
                 wrap(layout, context, "It is ignored.")
             else:
-                wrap(layout, context, "It is not ignored, and will smear in frozen frames.")
+                wrap(layout, context, "It is not ignored and will smear in frozen frames.")
         for kind in contract.MASK_KINDS:
             layout.prop(props, f"{kind}_from")
             shown = {"FILE": "path", "DRAWN": "drawn"}.get(getattr(props, f"{kind}_from"))

@@ -85,7 +85,7 @@ def guess_scale(scene: bpy.types.Scene, shot: Path, is_new: bool) -> list[str]:
     entry.guessed_scale = guess
     notes = move(scene, shot, np.diag([change] * 3 + [1.0]))
     if guess:
-        notes.append(f"The scale is a guess: the camera stands {HAND_HEIGHT:g} m above the floor.")
+        notes.append(f"The scale is estimated: the camera is {HAND_HEIGHT:g} m above the floor.")
     return notes
 
 

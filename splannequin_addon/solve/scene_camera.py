@@ -64,7 +64,8 @@ def _check_aspect_ratio(scene: bpy.types.Scene, size: tuple[int, int]) -> None:
     width, height = scene_setup.render_size(scene)
     if abs((width / height) / (size[0] / size[1]) - 1.0) > _ASPECT_SLACK:
         raise contract.JobError(
-            f"The scene renders {width} x {height} pixels, the clip has another shape, {size[0]} x {size[1]}.",
+            f"The scene renders {width} x {height} pixels, but the clip has a different aspect ratio, {size[0]} x "
+            f"{size[1]}.",
             "Set the scene's resolution and pixel aspect to the clip's.",
             contract.ExitCode.USAGE,
         )

@@ -10,12 +10,12 @@ from ..properties import BoolProperty, EnumProperty, FloatProperty, PointerPrope
 
 MASK_SOURCES = [
     ("NONE", "None", "No mask"),
-    ("FILE", "File", "A picture for all frames, a picture of a numbered sequence, or a video"),
-    ("ALPHA", "Alpha", "The alpha of the clip, if it has one: ignored is what is transparent, people are opaque"),
+    ("FILE", "File", "One image for all frames, an image of a numbered sequence, or a video"),
+    ("ALPHA", "Alpha", "The clip's alpha channel, if it has one: transparent areas are ignored, people are opaque"),
     ("DRAWN", "Drawn", "A mask of this file, drawn over the clip in the Movie Clip editor"),
 ]
 """Sources of a mask. The order is stored in .blend files: append new ones."""
-BURNT_IN = ("FOUND", "Burnt In", "A logo or a caption, if the import found one burnt into the clip; else nothing")
+BURNT_IN = ("FOUND", "Burnt In", "Burnt-in logo or caption that the import found in the clip; empty if there is none")
 """Additional source of the mask of ignored areas."""
 
 
@@ -62,9 +62,9 @@ class SolveSettings:
     )
     cameras_from = EnumProperty(
         name="Cameras From",
-        description="Solve the camera here, or take cameras that another program found for the same clip",
+        description="Solve the camera here, or use cameras that another program solved for the same clip",
         items=[
-            ("SOLVE", "Solve", "Find the camera from the clip"),
+            ("SOLVE", "Solve", "Solve the camera from the clip"),
             (
                 "FILE",
                 "File",
@@ -74,7 +74,7 @@ class SolveSettings:
             (
                 "SCENE",
                 "Scene Camera",
-                "An animated camera of this scene, such as a matchmove: frame by frame, with its lens",
+                "An animated camera of this scene, such as a matchmove, read frame by frame with its lens",
             ),
         ],
         options=set(),
@@ -91,13 +91,13 @@ class SolveSettings:
     )
     ignore_path = StringProperty(
         name="Mask to Ignore",
-        description="White is ignored: one picture for all frames, a picture of a numbered sequence, or a video",
+        description="White is ignored: one image for all frames, an image of a numbered sequence, or a video",
         subtype="FILE_PATH",
         options=compat.PATH_OPTIONS,
     )
     ignore_drawn = PointerProperty(
         name="Drawn Mask to Ignore",
-        description="What is inside is ignored",
+        description="The area inside the mask is ignored",
         type=bpy.types.Mask,
         options=set(),
     )
@@ -108,19 +108,19 @@ class SolveSettings:
     )
     people_path = StringProperty(
         name="Mask of People",
-        description="White may move: one picture for all frames, a picture of a numbered sequence, or a video",
+        description="White may move: one image for all frames, an image of a numbered sequence, or a video",
         subtype="FILE_PATH",
         options=compat.PATH_OPTIONS,
     )
     people_drawn = PointerProperty(
         name="Drawn Mask of People",
-        description="What is inside may move",
+        description="The area inside the mask may move",
         type=bpy.types.Mask,
         options=set(),
     )
     scene_camera = PointerProperty(
         name="Scene Camera",
-        description="Animated camera that stands where the clip's was; frame n of the scene is frame n of the clip",
+        description="Animated camera that matches the clip's camera; frame n of the scene is frame n of the clip",
         type=bpy.types.Object,
         poll=lambda _, item: getattr(item, "type", "") == "CAMERA",
         options=set(),

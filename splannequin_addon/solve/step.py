@@ -70,9 +70,11 @@ class Solve(Step):
         word = str(result.get("quality") or "").partition(":")[0]
         brief = word if word.lower() in contract.VERDICT_WORDS else ""
         if state.lacks_motion:
-            lines.append("What moves is not found yet: the training finds it first.")
+            lines.append("What moves is not known yet. Training will detect it first.")
         if cameras.find(scene, state.folder, "CAMERA") is None:
-            return View(True, True, lines, "The solve is not in this scene: load it.", brief, is_unfinished=True)
+            return View(
+                True, True, lines, "The solve is not in this scene. Load the camera.", brief, is_unfinished=True
+            )
         return View(True, True, lines, "", brief)
 
     def is_usable(self, job: jobs.Job) -> bool:
@@ -125,7 +127,7 @@ def solve_in_turns(scene_uid: int, shot: Path) -> Iterator[job_timer.Progress | 
         return
     if selection.shot_folder(scene) != shot:
         raise contract.JobError(
-            "Another shot was chosen while this one was made ready.", "Choose this one and solve again."
+            "Another shot was chosen while this one was being prepared.", "Choose this shot and solve again."
         )
     job_timer.follow("solve", begin.begin(scene, "solve", masks.params(scene, rendered=True)))
 

@@ -34,7 +34,7 @@ def sentences(facts: dict[str, Any]) -> list[str]:
     lines = [f"{undistort.name} and {redistort.name} are in {undistort.parent}."]
     if across or down:
         lines.append(
-            f"The lens sees {across:.1f} % of the width beyond each side, and {down:.1f} % of the height: "
-            "freeze with overscan to have that too."
+            f"The lens sees {across:.1f} % of the width and {down:.1f} % of the height beyond each side. Freeze "
+            "with overscan to include this area."
         )
     return lines

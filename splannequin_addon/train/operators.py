@@ -21,7 +21,7 @@ class SPLANNEQUIN_OT_train(step_operator.StepOperator, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_pick_run(pick_operators.Pick, bpy.types.Operator):
-    """Work with this run: it is shown, frozen from, and trained on"""
+    """Use this run for display, freezing and further training"""
 
     bl_idname = "splannequin.pick_run"
     bl_label = "Pick Run"
@@ -45,14 +45,14 @@ class SPLANNEQUIN_OT_pick_run(pick_operators.Pick, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_remove_run(pick_operators.Remove, bpy.types.Operator):
-    """Delete this run from the shot folder on disk, after a question. Takes that were frozen from it stay"""
+    """Delete this run from the shot folder on disk, after confirmation. Takes frozen from it are kept"""
 
     bl_idname = "splannequin.remove_run"
     bl_label = "Remove Run"
     bl_options = {"REGISTER", "INTERNAL"}
     kind = "run"
     question = "Delete this training run from disk?"
-    warning = "Takes that were frozen from it stay, but cannot be completed. This cannot be undone."
+    warning = "Takes frozen from it are kept but cannot be completed. This cannot be undone."
 
     name = StringProperty(name="Run", description="Name of the run to delete", options={"SKIP_SAVE"})
 

@@ -56,16 +56,17 @@ class TrainPanel(step_panel.StepPanel):
             for place, text in zip(columns[1:], (str(row.width or "-"), f"{row.steps / 1000:g}k", spent), strict=True):
                 place.label(text=text, translate=False)
         if basis is None and pace is not None:
-            words = "With a ?: an estimate by this machine's earlier trainings."
+            words = "A ? marks an estimate from earlier trainings on this computer."
         elif basis is None:
             words = (
-                "Preview took 1.5 to 3.5 minutes on two cores without a graphics card. "
-                "Times here come with the first run."
+                "Preview took 1.5 to 3.5 minutes on two cores without a graphics card. Times for this computer are "
+                "shown after the first run."
             )
         else:
             where = "graphics card" if basis.get("device") == "cuda" else "processor"
             words = (
-                f"Times as run {basis.get('run', '')} took on the {where}. A ? marks an estimate from pixels and steps."
+                f"Times measured in run {basis.get('run', '')} on the {where}. A ? marks an estimate from pixels and "
+                "steps."
             )
         wrap(layout, context, words)
 
@@ -111,7 +112,7 @@ class TrainPanel(step_panel.StepPanel):
             wrap(
                 body,
                 context,
-                f"{first:.1f} to {last:.1f} dB on frames kept out, in {contract.duration(seconds)}",
+                f"{first:.1f} to {last:.1f} dB on held-out frames, in {contract.duration(seconds)}",
                 "NONE",
             )
 

@@ -24,7 +24,7 @@ class Train(Step):
     label = "Train"
     kind = "train"
     button = "Train"
-    again = "Train On"
+    again = "Continue Training"
     needs = "Solve the camera first."
     panel = panel.PANEL
     classes = operators.CLASSES
@@ -47,7 +47,7 @@ class Train(Step):
         if run is None:
             return View(False, True, [], "Learn the scene and what moves in it.")
         psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
-        quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
+        quality = f"{psnr:.1f} dB on held-out frames" if psnr is not None else "no held-out frames"
         size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % may move"
         verdict, depth = contract.verdict_of(run), contract.depth_line(run)
         lines = [*(verdict.lines() if verdict is not None else ()), f"Run {settings_of(scene).run_name}: {quality}"]

@@ -35,28 +35,34 @@ def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Pla
     if stored is None:
         return Plan("train", "Train", "")
     if _can_resume_anew(stored, preset, depth):
-        words = "Paused while the run was trained anew. The run is as it was until the new one is done."
+        words = "Paused while the run was being retrained. The run does not change until the new training is done."
         return Plan("resume", "Resume", words)
     if stored.get("has_new_cameras"):
         return Plan(
-            "anew", "Train Anew", "The camera was solved again: training begins anew and replaces this run when done. "
-            "Give the run another name to keep it."
+            "anew", "Train from Scratch", "The camera was solved again. Training starts over and replaces this run "
+            "when done. Give the run another name to keep it."
         )  # fmt: skip
     if stored.get("preset", preset) != preset:
         return Plan(
-            "anew", "Train Anew", "This run has another preset: training begins anew and replaces it when done. "
-            "Give the run another name to keep it."
+            "anew", "Train from Scratch", "This run has a different preset. Training starts over and replaces this run "
+            "when done. Give the run another name to keep it."
         )  # fmt: skip
     if not _same_depth(stored, depth):
         return Plan(
-            "anew", "Train Anew", "This run has another depth sequence, or none: training begins anew and replaces "
-            "this run when done. Give the run another name to keep it."
+            "anew", "Train from Scratch", "This run has a different depth sequence or none. Training starts over and "
+            "replaces this run when done. Give the run another name to keep it."
         )  # fmt: skip
     if finished is None:
-        return Plan("resume", "Resume", "Paused. It goes on exactly where it stopped.")
+        return Plan("resume", "Resume", "Paused. Training continues exactly where it stopped.")
     if finished.get("extension") is not None:
-        return Plan("extension", "Resume", "Paused while steps were added. The run is as it was until all are done.")
-    return Plan("extend", "Train On", "Adds these steps to the run. It stays as it is until all are done.")
+        return Plan(
+            "extension",
+            "Resume",
+            "Paused while steps were being added. The run does not change until all steps are done.",
+        )
+    return Plan(
+        "extend", "Continue Training", "Adds these steps to the run. The run does not change until all steps are done."
+    )
 
 
 def _can_resume_anew(stored: dict[str, Any], preset: str, depth: str) -> bool:

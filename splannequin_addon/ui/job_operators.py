@@ -17,15 +17,15 @@ from . import step_operator
 
 
 class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
-    """Stop this step. It saves what it has first, so that it can go on later; pressed again after 20 seconds, it is
-    ended by force"""
+    """Stop this step. It saves its progress first, so that it can continue later. Press again after 20 seconds to end
+    it by force"""
 
     bl_idname = "splannequin.cancel"
     bl_label = "Cancel Step"
     bl_options = {"REGISTER"}
 
     step = StringProperty(
-        name="Step", description="Name of the step to cancel; empty: the one that runs", options={"SKIP_SAVE"}
+        name="Step", description="Name of the step to cancel; empty: the running step", options={"SKIP_SAVE"}
     )
 
     def execute(self, context: bpy.types.Context) -> Outcome:
@@ -55,8 +55,8 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_all_steps(step_operator.StepOperator, bpy.types.Operator):
-    """Solve the camera, train, and freeze t*, each with its own settings, as soon as the step before is done. What is
-    there already stays"""
+    """Solve the camera, train and freeze t*, one after the other, each with its own settings. Existing results are
+    kept"""
 
     bl_idname = "splannequin.all_steps"
     bl_label = "Solve, Train and Freeze"
@@ -68,7 +68,7 @@ class SPLANNEQUIN_OT_all_steps(step_operator.StepOperator, bpy.types.Operator):
         if not super().poll(context):
             return False
         if not all_steps.missing(scene_in(context)):
-            cls.poll_message_set(tr("There is nothing to do: import a clip, or freeze again with the button below"))
+            cls.poll_message_set(tr("Nothing to do. Import a clip, or freeze again with the button below"))
             return False
         return True
 

@@ -97,7 +97,9 @@ def remove(shot: Path, folder: Path, wait: bool) -> None:
     folder cannot be moved: a file is open elsewhere (Windows) or protected, or the parent is a link.
     """
     if contract.is_link(folder.parent):
-        raise OSError(errno.EPERM, f"{folder.parent.name} is a link to another folder: remove it there", str(folder))
+        raise OSError(
+            errno.EPERM, f"{folder.parent.name} is a link to another folder. Remove the item there", str(folder)
+        )
     trash = contract.ShotFolder(shot).trash
     if contract.is_link(trash):
         contract.remove_link(trash)

@@ -70,7 +70,7 @@ class Remove(Pick):
             except OSError as error:
                 refusal = f"{folder} cannot be removed: {error.strerror or error}"
         if refusal:
-            self.report({"ERROR"}, refusal)
+            self.report({"ERROR"}, tr(refusal))
             return {"CANCELLED"}
         job_timer.refresh(watch)
         job_timer.redraw()

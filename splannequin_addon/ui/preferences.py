@@ -30,26 +30,26 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
 
     backend_python = StringProperty(
         name="Backend Python",
-        description="Python interpreter of a backend environment that is there already; empty: found by itself",
+        description="Python interpreter of an existing backend environment; empty: detected automatically",
         subtype="FILE_PATH",
     )
     backend_folder = StringProperty(
         name="Folder",
-        description="Where Set Up Backend puts the environment; empty: a short path in your home folder",
+        description="Folder in which Set Up Backend creates the environment; empty: a short path in your home folder",
         subtype="DIR_PATH",
     )
     backend_wheels = StringProperty(
         name="Wheels",
-        description="Folder of wheels that Set Up Backend installs from, without a network; empty: from the internet",
+        description="Folder of wheels from which Set Up Backend installs offline; empty: download from the internet",
         subtype="DIR_PATH",
     )
     device = EnumProperty(
         name="Device",
-        description="Where the backend trains and freezes",
+        description="Device on which the backend trains and freezes",
         items=[
-            ("auto", "Automatic", "The NVIDIA card if there is one that can be used, else the processor"),
+            ("auto", "Automatic", "The NVIDIA card if a usable one is present, otherwise the processor"),
             ("cpu", "Processor", "Always the processor"),
-            ("cuda", "NVIDIA Card", "Only the NVIDIA card: without one, jobs end with a sentence"),
+            ("cuda", "NVIDIA Card", "Only the NVIDIA card. Without one, jobs stop with an error"),
         ],
     )
 
@@ -78,7 +78,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         row.enabled = not busy()
         row.prop(self, "backend_folder")
         if not self.backend_folder:
-            self._say(box, f"Without a folder it goes to {environment.default_folder()}.", "INFO")
+            self._say(box, f"Without a folder, the backend is installed in {environment.default_folder()}.", "INFO")
         row = box.row()
         row.enabled = not busy()
         row.prop(self, "backend_wheels")
@@ -98,9 +98,9 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
                 column = box.column(align=True)
                 column.alert = True
                 self._say(column, _setup.failure, "ERROR")
-                self._say(column, "Repair goes on where it stopped.", "BLANK1")
+                self._say(column, "Repair continues where the set-up stopped.", "BLANK1")
         elif not has_backend:
-            self._say(box, f"Makes a Python environment of its own, {environment.SIZE}.", "INFO")
+            self._say(box, f"Creates a separate Python environment, {environment.SIZE}.", "INFO")
             self._say(box, f"It installs {environment.LICENCES}.", "BLANK1")
         if _is_offline():
             self._say(box, _OFFLINE, "ERROR")
@@ -111,8 +111,8 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
 
 
 _OFFLINE = (
-    "Blender may not go online: allow it in Preferences > System > Network, "
-    "or choose a folder of wheels in the add-on's preferences."
+    "Blender's online access is turned off. Allow it in Preferences > System > Network, or choose a "
+    "folder of wheels in the add-on's preferences."
 )
 
 
@@ -139,7 +139,7 @@ def running_setup() -> environment.SetUp | None:
 
 
 class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
-    """Download and install what the backend needs, into an environment of its own"""
+    """Download and install the backend's packages into a separate environment"""
 
     bl_idname = "splannequin.set_up"
     bl_label = "Set Up Backend"
@@ -167,11 +167,11 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
         size, places = environment.SIZE, environment.sources()
         source = f"Needs {size}, downloaded from {places}." if wheels is None else f"Needs {size}, taken from {wheels}."
         for text in (
-            f"Makes a Python environment in {backend.folder()}",
+            f"Creates a Python environment in {backend.folder()}",
             source,
             f"Installs {environment.LICENCES}.",
             "The SHA-256 of each file is compared with this add-on's list before it is installed.",
-            "A build of PyTorch that is not in the list is compared with what its own index states.",
+            "A PyTorch build that is not in the list is compared with the hash stated by its package index.",
             "Nothing is changed in Blender's own Python.",
         ):
             wrap(column, context, text, width=_DIALOG)
@@ -202,13 +202,13 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
             _setup.process.wait()
         environment.poll(_setup)
         if _setup.failure:
-            self.report({"ERROR"}, _setup.failure)
+            self.report({"ERROR"}, tr(_setup.failure))
             return {"CANCELLED"}
         return {"FINISHED"}
 
 
 class SPLANNEQUIN_OT_cancel_setup(bpy.types.Operator):
-    """Stop the set-up; it goes on from there when it is started again"""
+    """Stop the set-up. It continues from there when it is started again"""
 
     bl_idname = "splannequin.cancel_setup"
     bl_label = "Cancel"
@@ -222,7 +222,7 @@ class SPLANNEQUIN_OT_cancel_setup(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
-    """Start the backend once and say what it can do on this machine"""
+    """Start the backend once and show what it can do on this computer"""
 
     bl_idname = "splannequin.check_backend"
     bl_label = "Check Backend"
@@ -249,7 +249,7 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
-    """Delete the environment that Set Up Backend made. Shots and their runs stay"""
+    """Delete the environment that Set Up Backend created. Shots and their runs are kept"""
 
     bl_idname = "splannequin.remove_backend"
     bl_label = "Remove Backend"
@@ -262,12 +262,18 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Deletes the environment, unless it is in use."""
         if busy():
-            self.report({"ERROR"}, "The environment stays: it is being set up")
+            self.report({"ERROR"}, "The environment was not removed, because it is being set up")
             return {"CANCELLED"}
         for watch in job_timer.watches():
             if any(not job.ended for job in watch.jobs.values()):
                 name = watch.shot.name
-                self.report({"ERROR"}, tr(f"The environment stays: a step of {name} runs. Wait for it or cancel it."))
+                self.report(
+                    {"ERROR"},
+                    tr(
+                        f"The environment was not removed, because a step of {name} is running. Wait for it or "
+                        "cancel it."
+                    ),
+                )
                 return {"CANCELLED"}
         try:
             was_removed = environment.remove(backend.folder(), wait=bpy.app.background)
@@ -275,7 +281,7 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
             self.report({"ERROR"}, tr(_at_work(error.pid)))
             return {"CANCELLED"}
         except (OSError, ValueError) as error:
-            self.report({"ERROR"}, tr(f"The environment stays: {error}"))
+            self.report({"ERROR"}, tr(f"The environment was not removed: {error}"))
             return {"CANCELLED"}
         _findings.clear()
         self.report({"INFO"}, "The backend's environment was removed" if was_removed else "There was nothing to remove")
@@ -284,8 +290,8 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
 
 def _at_work(pid: int) -> str:
     return (
-        f"The environment stays: another Blender, a live view or a command line works with it (process {pid}). "
-        "Wait for it or end it."
+        "The environment was not removed, because another Blender, a live view or a command line uses it "
+        f"(process {pid}). Wait for it or end it."
     )
 
 

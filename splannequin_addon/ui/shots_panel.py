@@ -45,7 +45,7 @@ class SPLANNEQUIN_UL_shots(bpy.types.UIList):
 
 
 class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
-    """Begin another shot in this scene. The ones that are there keep their settings, cameras and frames"""
+    """Add another shot to this scene. Existing shots keep their settings, cameras and frames"""
 
     bl_idname = "splannequin.shot_add"
     bl_label = "New Shot"
@@ -66,15 +66,15 @@ class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
-    """Take the chosen shot off the list. Its folder on disk stays"""
+    """Remove the chosen shot from the list. Its folder on disk is kept"""
 
     bl_idname = "splannequin.shot_remove"
     bl_label = "Remove Shot from List"
     bl_options = {"REGISTER", "UNDO"}
 
     things = BoolProperty(
-        name="Remove Its Things from the File",
-        description="Take its camera, points, markers and compositor group out of the file, too",
+        name="Remove Shot Data from File",
+        description="Also remove its camera, points, markers and compositor group from the file",
         default=True,
         options={"SKIP_SAVE"},
     )
@@ -96,23 +96,23 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         if self.things and selection.folders(scene).count(folder) > 1:
-            self.report({"INFO"}, "Its things stay: another shot of the list has the same folder")
+            self.report({"INFO"}, "The shot's data is kept, because another shot in the list has the same folder")
         elif self.things and folder is not None:
             for note in begin.remove_all(scene, folder):
-                self.report({"INFO"}, note)
+                self.report({"INFO"}, tr(note))
         selection.remove(scene, settings_of(scene).loaded_shot)
         return {"FINISHED"}
 
 
 class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
-    """Say where the folder of this shot is now. The camera, the points and the compositor's frames follow it"""
+    """Set the new location of this shot's folder. The camera, the points and the compositor's frames are updated"""
 
     bl_idname = "splannequin.locate_shot"
     bl_label = "Locate Shot Folder"
     bl_options = {"REGISTER", "UNDO"}
 
     directory = StringProperty(
-        name="Folder", description="Folder of the shot: the one that holds shot.json", subtype="DIR_PATH"
+        name="Folder", description="Folder of the shot, which contains shot.json", subtype="DIR_PATH"
     )
     filter_folder = BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 

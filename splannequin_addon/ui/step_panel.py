@@ -184,7 +184,7 @@ class StepPanel:
                 box.operator("splannequin.open_log", text="Open Log", icon="TEXT").step = self.step
             return
         if job is not None and job.state == "cancelled" and not self._paused(context):
-            wrap(layout, context, "Cancelled. Finished work is kept: start it again to go on.", "CANCEL")
+            wrap(layout, context, "Cancelled. Finished work is kept. Start the step again to continue.", "CANCEL")
         for line in new_warnings(job.warnings if job is not None else [], shown):
             wrap(layout, context, line, "ERROR")
         for note in watch.notes.get(self.step, []):

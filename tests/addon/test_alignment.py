@@ -139,7 +139,7 @@ def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, 
     root.scale = (5.0, 5.0, 5.0)  # by hand
     bpy.context.view_layer.update()
     assert addon("bake.shown_take").stale_scale(built, shot)
-    assert any("stale" in line for line in addon("process.steps").STEPS["bake"].view(built, state).state)
+    assert any("outdated" in line for line in addon("process.steps").STEPS["bake"].view(built, state).state)
     addon("bake.insertion").insert_freeze(built, shot, "freeze")
     assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(5.0) and not addon(
         "bake.shown_take"

@@ -107,7 +107,7 @@ def test_of_several_cameras_the_first_that_moves_is_taken_and_said(filmed, readi
     animated(filmed, "a", end=0.0)
     animated(filmed, "c")
     told = reading()
-    assert told["splannequin"]["notes"][0][0] == "set.abc holds 3 cameras: b was taken, the first that moves."
+    assert told["splannequin"]["notes"][0][0] == "set.abc contains 3 cameras. b was used, the first that moves."
 
 
 def test_a_film_back_of_another_shape_is_said_and_its_width_is_the_frames(filmed, reading):

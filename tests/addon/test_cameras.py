@@ -352,7 +352,7 @@ def test_motion_blur_takes_the_scenes_shutter_and_only_on_a_camera_of_the_artist
     props.run_name = take["run"]
     assert "motion blur" not in takes.outdated(scene, take)
     scene.render.motion_blur_shutter = 0.5
-    assert takes.outdated(scene, take) == "Its motion blur is not the one chosen now."
+    assert takes.outdated(scene, take) == "The take's motion blur differs from the current setting."
     props.path_camera = scene.camera
     assert takes.params_of(scene).shutter == 0.0, "the clip's own path has its plates' blur"
 
@@ -399,7 +399,7 @@ def test_a_camera_that_blender_does_not_evaluate_is_refused(addon, contract, mov
         moving.objects["Camera"].hide_viewport = True
     else:
         bpy.context.view_layer.layer_collection.children[0].exclude = True
-    with pytest.raises(contract.JobError, match="Camera does not move: it is disabled"):
+    with pytest.raises(contract.JobError, match="Camera does not move, because it is disabled"):
         path_of(addon, moving, shot)
     moving.camera = moving.objects["Camera"]
     assert path_of(addon, moving, shot) == wanted, "the scene's camera is always evaluated"

@@ -112,7 +112,7 @@ def test_a_take_of_the_artists_camera_is_combined_through_it(addon, contract, so
     camera, clips = own(), solved.camera
     addon("bake.insertion").insert_freeze(solved, shot, "mine")
     said = addon("bake.insertion").combine_cg(solved, shot)
-    assert solved.camera == camera and any(line.startswith("Mine is the scene's camera now") for line in said)
+    assert solved.camera == camera and any(line.startswith("Mine is now the scene's camera") for line in said)
     assert bake(addon, solved, tmp_path / "out") == [5, 6, 7]
     solved.camera = clips
     with pytest.raises(contract.JobError, match="camera of take mine") as failure:
@@ -142,7 +142,7 @@ def test_no_camera_that_fits_is_said_and_nothing_is_changed(addon, contract, sol
         addon("bake.insertion").combine_cg(solved, shot)
     assert len(addon("compat").compositor_tree(solved).nodes) == nodes and not solved.render.film_transparent
     contract.ShotFolder(shot).camera_path("mine").unlink()
-    with pytest.raises(contract.JobError, match="is not known any more"):
+    with pytest.raises(contract.JobError, match="is no longer known"):
         addon("bake.insertion").combine_cg(solved, shot)
 
 

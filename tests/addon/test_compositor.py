@@ -106,7 +106,7 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
     said = compositor.insert(scene, take, plate)
     tree = compat.compositor_tree(scene)
     assert compat.compositor_enabled(scene)
-    assert "minimal one was made" in said[0]
+    assert "minimal one was created" in said[0]
     assert sorted(
         n.bl_idname for n in tree.nodes if "Output" not in n.bl_idname and "Composite" not in n.bl_idname[-9:]
     ) == [
@@ -184,7 +184,7 @@ def test_group_offers_what_a_compositor_needs(addon, scene, take, contract):
 
 def test_take_without_frames_is_refused_in_words(addon, scene, shot, contract):
     (shot / "takes" / "empty").mkdir()
-    with pytest.raises(contract.JobError, match=r"'empty' .* holds no frozen frames"):
+    with pytest.raises(contract.JobError, match=r"'empty' .* has no frozen frames"):
         addon("bake.insertion").insert(scene, shot, "empty")
 
 
@@ -212,7 +212,7 @@ def test_size_comes_from_the_exr_header(addon, shot, tmp_path):
     assert addon("bake.take_files").exr_windows(shot / "takes" / "freeze" / "000006.exr")[0] == (16, 12)
     wrong = tmp_path / "wrong.exr"
     wrong.write_bytes(b"no picture")
-    with pytest.raises(ValueError, match="no OpenEXR file"):
+    with pytest.raises(ValueError, match="not an OpenEXR file"):
         addon("bake.take_files").exr_windows(wrong)
 
 
@@ -312,7 +312,7 @@ def test_behind_a_plate_the_grade_goes_on_from_the_frozen_frame(addon, scene, sh
     tree, plate = graded(shot / "frames" / "000005.png")
     before = snapshot(tree)
     said = addon("bake.insertion").insert(scene, shot, "freeze")
-    assert "as the plate" in said[0]
+    assert "in place of the plate" in said[0]
     compositor = addon("bake.compositor")
     node = addon("bake.freeze_group").group_node(tree)
     nodes, links = snapshot(tree, addon("bake.node_names").GROUP_NAME)

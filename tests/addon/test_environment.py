@@ -60,7 +60,7 @@ def test_a_folder_that_cannot_be_is_named(addon, contract, root, tmp_path):
 
 def test_what_is_not_ours_is_not_removed(addon, tmp_path):
     (tmp_path / ".venv").mkdir()
-    with pytest.raises(ValueError, match="was not made by Splannequin"):
+    with pytest.raises(ValueError, match="was not created by Splannequin"):
         addon("process.environment").remove(tmp_path)
     assert (tmp_path / ".venv").is_dir()
 
@@ -102,7 +102,7 @@ def test_what_a_job_works_with_is_not_removed(addon, contract, made, shot):
     supervisor, jobs = addon("process.job_timer"), addon("process.jobs")
     job = jobs.new_job(shot, "train", contract.TrainParams())
     supervisor.follow("train", job)
-    with pytest.raises(RuntimeError, match=f"a step of {shot.name} runs"):
+    with pytest.raises(RuntimeError, match=f"a step of {shot.name} is running"):
         bpy.ops.splannequin.remove_backend()
     assert (made / ".venv" / "package.py").exists()
     job.status = contract.Status("train", "done", 0, 0.0, 1.0, 0.0)
@@ -130,7 +130,7 @@ def test_what_a_process_of_others_works_with_is_not_removed(addon, made):
     """A job of another Blender or of a command line is unknown to this Blender."""
     with at_work(made) as other:
         try:
-            with pytest.raises(RuntimeError, match=rf"stays: another Blender.*\(process {other.pid}\)"):
+            with pytest.raises(RuntimeError, match=rf"not removed, because another Blender.*\(process {other.pid}\)"):
                 bpy.ops.splannequin.remove_backend()
             assert other.poll() is None and (made / ".venv" / "package.py").exists()
         finally:
@@ -177,7 +177,7 @@ def system(addon, tmp_path, monkeypatch):
 @pytest.mark.skipif(bpy.app.online_access_override, reason="this Blender was started online or offline for good")
 def test_offline_the_button_says_so_and_goes_online_only_when_it_is_told_to(system, tmp_path):
     assert bpy.ops.splannequin.set_up.poll(), "a grey button offers nothing"
-    with pytest.raises(RuntimeError, match="may not go online"):
+    with pytest.raises(RuntimeError, match="online access is turned off"):
         bpy.ops.splannequin.set_up()
     assert not system.use_online_access and not (tmp_path / "backend").exists()
     with pytest.raises(RuntimeError, match="failed at installing packages"):

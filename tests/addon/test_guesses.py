@@ -85,4 +85,4 @@ def test_markers_are_part_of_the_undo_step_and_of_the_file(addon, failed, shot, 
 
 def test_the_camera_step_says_how_many_are_guesses(addon, failed, shot):
     lines = addon("process.steps").STEPS["solve"].view(failed, addon("shot.inventory").read(shot)).state
-    assert lines == ["A poor solve.", "4 of 8 frames have a guessed camera: pink keys on the timeline."]
+    assert lines == ["A poor solve.", "4 of 8 frames have a guessed camera, shown as pink keys on the timeline."]

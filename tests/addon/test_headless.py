@@ -111,7 +111,7 @@ def test_python_in_the_artists_file_does_not_run(run, shot, tmp_path, kind):
     finally:
         bpy.context.preferences.filepaths.use_scripts_auto_execute = False
     assert code == 0 and not ran.exists()
-    assert "artist.blend has Python in it" in said
+    assert "artist.blend contains Python" in said
 
 
 def test_camera_points_and_plate_are_in_the_baked_file(run, shot, tmp_path):
@@ -129,9 +129,9 @@ def test_camera_points_and_plate_are_in_the_baked_file(run, shot, tmp_path):
     [
         ((), 2, "required"),
         (("bake",), 2, "--shot"),
-        (("bake", "--shot", "nowhere", "--output", "out"), 2, "is no shot folder"),
-        (("status", "nowhere"), 2, "is no shot folder"),
-        (("solve", "nowhere"), 2, "is no shot folder"),
+        (("bake", "--shot", "nowhere", "--output", "out"), 2, "is not a shot folder"),
+        (("status", "nowhere"), 2, "is not a shot folder"),
+        (("solve", "nowhere"), 2, "is not a shot folder"),
         (("freeze", "no-such-clip.mp4", "--output", "out"), 3, "no-such-clip.mp4"),
         (("freeze", "clip.mp4", "--preset", "best"), 2, "invalid choice"),
     ],
@@ -234,8 +234,8 @@ def test_both_command_lines_print_the_same_options_for_the_same_verb(addon, pack
     for verb in ours.keys() & theirs.keys():
         if "--device" in ours[verb]:  # without this option the add-on uses its preferences
             said, choices, default, *rest = ours[verb]["--device"]
-            assert said.endswith("(default: as the preferences say)") and default == ""
-            ours[verb]["--device"] = (said.replace("as the preferences say", "auto"), choices, "auto", *rest)
+            assert said.endswith("(default: from the add-on's preferences)") and default == ""
+            ours[verb]["--device"] = (said.replace("from the add-on's preferences", "auto"), choices, "auto", *rest)
         if verb == "freeze":
             assert ours[verb].pop("--blend"), "a .blend is Blender's own"
         assert ours[verb] == theirs[verb], verb

@@ -143,7 +143,7 @@ def test_a_bake_comes_into_the_scene_where_it_was_asked_for_alone(addon, contrac
     watch.work = None
     ended_bake(addon, contract, supervisor, watch, shot, "A lookdev")
     until_it_renders(supervisor, watch)
-    assert baked(addon) == ["A lookdev"] and "A lookdev is in no window" in watch.notes["bake"][-1]
+    assert baked(addon) == ["A lookdev"] and "A lookdev is not open in any window" in watch.notes["bake"][-1]
 
 
 def test_a_bake_of_a_scene_that_is_gone_comes_into_those_of_the_shot(addon, contract, supervisor, watch, shot):
@@ -300,7 +300,7 @@ def test_a_render_that_tells_no_end_is_over(addon, supervisor, watch, shot, smal
     assert watch.running() == "bake", "the job of a render may be about to begin"
     supervisor.tick()
     assert watch.running() is None and not supervisor._callbacks
-    assert "wrote no picture for frame 1" in watch.failures["bake"][0]
+    assert "wrote no image for frame 1" in watch.failures["bake"][0]
     assert scene.render.filepath.endswith("f_####")
 
 
@@ -413,7 +413,7 @@ def test_a_solve_that_is_stopped_after_its_cameras_are_known_leaves_them(addon, 
     tell("done", state, state=state, result=None)
     assert watch.running() is None and addon("solve.cameras").find(scene, shot, "CAMERA") is not None
     said = addon("process.steps").STEPS["solve"].view(scene, watch.state).state
-    assert any("What moves is not found yet" in line for line in said)
+    assert any("What moves is not known yet" in line for line in said)
     (shot / "solve" / "motion" / "motion.json").write_text("{}")
     addon("process.job_timer").refresh(watch)
     said = addon("process.steps").STEPS["solve"].view(scene, watch.state).state

@@ -93,7 +93,7 @@ def test_a_killed_child_leaves_a_status_that_says_so(addon, contract, start_impo
     while jobs.poll(job, 0.5) == [] and not job.ended:
         time.sleep(0.02)
     os.kill(job.process.pid, signal.SIGKILL)
-    with pytest.raises(contract.JobError, match="stopped without a word"):
+    with pytest.raises(contract.JobError, match="stopped unexpectedly"):
         jobs.wait(job)
     told = json.loads((job.folder / "status.json").read_text())
     assert told["state"] == "failed" and "memory" in told["hint"]
@@ -255,7 +255,7 @@ def test_cancel_ends_no_process_on_a_files_word(addon, contract, empty_shot, sle
     jobs, innocent = addon("process.jobs"), sleeper(*words)
     for host in ("", contract.computer_name()):
         job = believed_running(jobs, contract, empty_shot, innocent.pid, contract.process_start(innocent.pid), host)
-        with pytest.raises(contract.JobError, match="cannot be told from others"):
+        with pytest.raises(contract.JobError, match="could not be identified"):
             jobs.cancel(job)
         assert innocent.poll() is None
 
@@ -277,7 +277,7 @@ def test_a_job_of_another_computer_is_neither_dead_nor_ended(addon, contract, em
     jobs, innocent = addon("process.jobs"), sleeper()
     job = believed_running(jobs, contract, empty_shot, innocent.pid, 1.0, "elsewhere (0a1b2c3d)")
     assert jobs.is_alive(job, job.status)
-    with pytest.raises(contract.JobError, match="runs on elsewhere: only there"):
+    with pytest.raises(contract.JobError, match="runs on elsewhere and can only be ended there"):
         jobs.cancel(job)
     before = (job.folder / "status.json").read_bytes()
     writer = contract.Writer("elsewhere (0a1b2c3d)", innocent.pid, 1.0, "train", job.folder.name, time.time())
@@ -322,6 +322,12 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     told = contract.Status("train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.computer_name())
     contract.write_json(ending.folder / "status.json", dataclasses.asdict(told))
     jobs.refuse_second_writer(empty_shot)  # the process that reported its end will release the lock soon
+    (empty_shot / "lock.json").unlink()
+    running = dataclasses.replace(told, state="running", started=writer.since, exit_code=None)
+    contract.write_json(ending.folder / "status.json", dataclasses.asdict(running))
+    with pytest.raises(contract.JobError) as told:
+        jobs.refuse_second_writer(empty_shot)  # a local job that does not hold the lock yet is named, too
+    assert told.value.message == f"The training of {empty_shot.name} has been running on {where} since {since}."
     worker.kill()
     worker.wait()
     contract.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))

@@ -189,9 +189,9 @@ def test_what_cannot_be_added_is_a_sentence(scene, shot, lit, addon, contract):
     light = contract.TakeFolder(shot / "takes" / "freeze").light(KEY)
     light.write_bytes(light.read_bytes()[:-1])
     world = scene.world
-    with pytest.raises(contract.JobError, match="no such light"):
+    with pytest.raises(contract.JobError, match="does not have this light"):
         add(addon, scene, shot)
-    with pytest.raises(contract.JobError, match="no such light"):
+    with pytest.raises(contract.JobError, match="does not have this light"):
         add(addon, scene, shot, "../x")
     addon("process.begin").remove_all(scene, shot)
     with pytest.raises(contract.JobError, match="not in this scene"):

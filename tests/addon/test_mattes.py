@@ -127,7 +127,7 @@ def test_refusals_are_sentences(matted, scene):
         bpy.ops.splannequin.paint_motion()
     for path in (matted / "solve" / "motion").iterdir():
         path.unlink()
-    with pytest.raises(RuntimeError, match=r"my shot é has no motion matte here"):
+    with pytest.raises(RuntimeError, match=r"my shot é has no motion matte"):
         bpy.ops.splannequin.show_motion()
 
 

@@ -127,12 +127,12 @@ def test_where_nothing_fits_a_sentence_says_so_and_the_scene_stays_as_it_was(roo
     told = blender(tmp_path / "config.ocio", root, shot, tmp_path)
     for step in ("first", "again"):
         assert told[step]["error"] == (
-            "The colour configuration that Blender was started with (OCIO) has no colour space for sRGB. "
-            "Start Blender without it, or add one to it."
+            "Blender's OCIO colour configuration has no colour space for sRGB. "
+            "Start Blender without this configuration, or add the colour space to it."
         )
         assert told[step]["changed"] == {}, f"{step}: a build that failed left something behind"
     assert told["without a plate"]["changed"]["made"] == [[], ["my shot é"]]
-    assert "no view that leaves colours alone" in told["freeze"]["error"] and told["freeze"]["changed"] == {}
+    assert "no view that keeps colours unchanged" in told["freeze"]["error"] and told["freeze"]["changed"] == {}
     assert "no colour space for scene-linear Rec.709" in told["as they come"]["error"]
     assert told["as they come"]["changed"] == {}
 
@@ -169,7 +169,7 @@ def test_light_passes_an_aces_scene_within_a_thousandth(root, shot, tmp_path):
     """Rec.709 values from -0.2 to 50 through ACEScg, for the plate, the take's frames, and the plate frozen by its
     warp."""
     told = blender(CG_CONFIG, root, with_detail(shot, [0.78125, 0.390625, 0.1953125]), tmp_path, "in_aces")
-    assert any("000005.exr itself" in line for line in told["said"])
+    assert any("000005.exr is used as the plate" in line for line in told["said"])
     half = made.frozen(6).astype(np.float32).astype(np.float16)
     for name, expected in (("plate", made.plate(6)), ("frozen", half), ("warp", made.frozen(6))):
         assert off(light(tmp_path / f"{name}.exr"), expected @ TO_AP1.T) < 1e-3, name

@@ -65,7 +65,7 @@ def st_map(path: Path, places: np.ndarray) -> None:
 
 def test_mix_0_is_the_footage_bit_for_bit_and_no_copy_is_shown(addon, scene, footage, tmp_path):
     said = addon("bake.insertion").insert_freeze(scene, footage(), "detail")
-    assert "The plate is 000005.exr itself, 56 x 42." in said
+    assert "The footage 000005.exr is used as the plate, 56 x 42." in said
     shown = [Path(bpy.path.abspath(image.filepath)) for image in bpy.data.images if image.name.startswith("Plate")]
     assert [path.suffix for path in shown] == [".exr"] and "the plate" in str(shown[0])
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
@@ -85,7 +85,7 @@ def test_footage_that_the_shot_numbers_otherwise_is_shown_at_the_shots_frames(ad
     facts["footage"]["file"] = str(folder / f"moved.{5 - shift:06d}.exr")
     take.write_text(json.dumps(facts))
     said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
-    assert any("itself, 56 x 42." in line for line in said)
+    assert any("is used as the plate, 56 x 42." in line for line in said)
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
     for frame in (5, 6):
         assert np.array_equal(render(scene, tmp_path, frame), made.plate(frame))
@@ -95,7 +95,7 @@ def test_acescg_footage_is_brought_to_the_scenes_light(addon, scene, footage, tm
     """Under Blender's default configuration, scene light is linear Rec.709."""
     matrix = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
     said = addon("bake.insertion").insert_freeze(scene, footage(probe=(matrix @ LINEAR).tolist()), "detail")
-    assert "The plate is 000005.exr itself, 56 x 42." in said
+    assert "The footage 000005.exr is used as the plate, 56 x 42." in said
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
     found, expected = render(scene, tmp_path, 6), made.plate(6) @ matrix.T
     assert float((np.abs(found - expected).max(-1) / np.abs(expected).max(-1)).max()) < 1e-3
@@ -113,7 +113,7 @@ def test_its_lens_is_taken_away_by_the_takes_map(addon, scene, footage, tmp_path
     shot = footage(map="stmap/undistort.exr")
     st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(6))
     said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
-    assert "The plate is 000005.exr itself, 56 x 42, without its lens by the take's ST map." in said
+    assert "The footage 000005.exr is used as the plate, 56 x 42, undistorted by the take's ST map." in said
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
     found, expected = render(scene, tmp_path, 6), made.moved(made.plate(6), 6)
     assert float((np.abs(found - expected) / np.maximum(np.abs(expected), 0.05)).max()) < 2e-3
@@ -169,7 +169,7 @@ def test_a_video_shows_frame_n_at_frame_n(addon, scene, footage, tmp_path):
     shot = footage(**told, probe=list(SRGB), space="video, Rec.709")
     scene.render.resolution_x, scene.render.resolution_y = size
     said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
-    assert "The plate is levels.mp4 itself, 64 x 48." in said
+    assert "The footage levels.mp4 is used as the plate, 64 x 48." in said
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
     for frame in (5, 6):
         light = render(scene, tmp_path, frame, size)[20, 30]
@@ -192,18 +192,21 @@ def test_a_turned_video_is_the_plate_where_blender_turns_it_and_working_frames_e
     image = bpy.data.images.load(str(tmp_path / "turned.mp4"))
     if code != 3:
         assert (list(image.size) == size) == turns, "what this Blender does is what is known of it"
-    itself = any(line.startswith("The plate is turned.mp4 itself") for line in said)
-    assert itself == turns and turns != any("it is turned by its header" in line for line in said)
+    itself = any(line.startswith("The footage turned.mp4 is used as the plate") for line in said)
+    assert itself == turns and turns != any("its header rotates the image" in line for line in said)
 
 
 @pytest.mark.parametrize(
     "told, why",
     [
         ({"unlike": "its pixels are not square"}, "000005.exr: its pixels are not square"),
-        ({"file": "/nowhere/a.0001.exr", "beside": ""}, "a.0001.exr is not there any more"),
+        ({"file": "/nowhere/a.0001.exr", "beside": ""}, "a.0001.exr no longer exists"),
         ({"size": [64, 48]}, "Blender reads 000005.exr at 56 x 42"),
-        ({"probe": [7.0, 0.3, 0.2], "space": "a log"}, "Blender's colour configuration has no space like a log"),
-        ({"map": "stmap/undistort.exr"}, "the take's ST map is gone"),
+        (
+            {"probe": [7.0, 0.3, 0.2], "space": "a log"},
+            "Blender's colour configuration has no colour space that matches a log",
+        ),
+        ({"map": "stmap/undistort.exr"}, "the take's ST map no longer exists"),
     ],
 )
 def test_working_frames_stand_in_and_a_sentence_says_why(addon, scene, footage, told, why):
@@ -237,7 +240,9 @@ def test_blender_looks_for_the_files_that_the_import_says_it_does(contract, tmp_
 
 def test_footage_moved_together_with_the_shot_is_found(addon, scene, footage):
     shot = footage(file="/nowhere/000005.exr")
-    assert "The plate is 000005.exr itself, 56 x 42." in addon("bake.insertion").insert_freeze(scene, shot, "detail")
+    assert "The footage 000005.exr is used as the plate, 56 x 42." in addon("bake.insertion").insert_freeze(
+        scene, shot, "detail"
+    )
 
 
 def test_a_take_of_before_shows_the_working_frames_as_it_did(addon, scene, shot):

@@ -200,13 +200,13 @@ def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     watch = addon("process.job_timer").watch_of(before)
     assert addon("shot.selection").missing(scene, watch.state)
     for step in ("solve", "train", "freeze", "bake"):
-        with pytest.raises(contract.JobError, match="is not there any more") as told:
+        with pytest.raises(contract.JobError, match="no longer exists") as told:
             addon("process.begin").begin(scene, step)
         assert "Locate" in told.value.hint
     with pytest.raises(contract.JobError):
         addon("freeze.takes").freeze_from(scene, contract.CameraPath(4, 4, []))
     assert not before.exists()
-    with pytest.raises(RuntimeError, match="is no shot folder"):
+    with pytest.raises(RuntimeError, match="is not a shot folder"):
         bpy.ops.splannequin.locate_shot(directory=str(project))
     assert bpy.ops.splannequin.locate_shot(directory=f"{there}/") == {"FINISHED"}
     assert (

@@ -148,7 +148,7 @@ def test_what_the_artist_leads_in_instead_is_left_alone(bake, footage):
     footage()
     bake("detail")
     assert links(tree) == before and len(tree.nodes) == nodes
-    assert not any("The plate is" in line for line in bake.said)
+    assert not any("is used as the plate" in line for line in bake.said)
     assert not [i.name for i in bpy.data.images if "the plate" in i.filepath], "what is not shown is not kept"
     tree.links.remove(group.inputs["Image"].links[0])
     bake("detail")

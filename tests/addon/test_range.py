@@ -100,7 +100,7 @@ def test_frames_of_the_range_that_the_take_lacks_are_told(addon, with_shot, shot
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     with_shot.frame_start, with_shot.frame_end = 5, 7
     said = addon("bake.insertion").insert(with_shot, shot, "freeze")
-    assert "1 frames of the scene's range are not in the take, the first is 6." in said
+    assert "The take lacks 1 frames of the scene's range. The first missing frame is 6." in said
     with_shot.frame_step = 2
     assert not any("not in the take" in line for line in addon("bake.insertion").insert(with_shot, shot, "freeze"))
 

@@ -176,7 +176,7 @@ def test_two_slashes_are_a_whole_path(addon, baked, tmp_path):
 @pytest.mark.parametrize("name", ["/".join(letter * 200 for letter in "vwxyz")])
 def test_a_folder_that_blender_cannot_name_is_refused(addon, contract, baked, tmp_path, name):
     before = state(baked)
-    with pytest.raises(contract.JobError, match="Blender cannot write pictures to") as failure:
+    with pytest.raises(contract.JobError, match="Blender cannot write images to") as failure:
         addon("bake.rendering").render(baked, tmp_path / name, png=False)
     failure.value.message.encode()  # can be printed
     assert state(baked) == before

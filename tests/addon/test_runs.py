@@ -43,13 +43,15 @@ def plan(addon, scene):
 
 def test_the_button_says_what_it_will_do(addon, with_runs, shot):
     props = with_runs.splannequin
-    assert plan(addon, with_runs).button == "Train On"
+    assert plan(addon, with_runs).button == "Continue Training"
     props.run_name = "new"
     assert (plan(addon, with_runs).button, plan(addon, with_runs).words) == ("Train", "")
     props.run_name = "better"
     assert (plan(addon, with_runs).kind, plan(addon, with_runs).button) == ("resume", "Resume")
     props.preset = "final"
-    assert plan(addon, with_runs).button == "Train Anew" and "another preset" in plan(addon, with_runs).words
+    assert (
+        plan(addon, with_runs).button == "Train from Scratch" and "a different preset" in plan(addon, with_runs).words
+    )
     props.run_name = "main"
     assert plan(addon, with_runs).kind == "anew"
     props.preset = "preview"
@@ -73,9 +75,9 @@ def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, sh
     state = shots.read(shot)
     assert set(state.runs) == {"main"} and set(state.unfinished) == {"better"}
     assert addon("train.training").history(state.runs["main"], [(4.0, 21.0)]) == [(3.0, 20.0), (4.0, 21.0)]
-    assert plan(addon, with_runs).button == "Train On", "the run that is there is of the preset that is chosen"
+    assert plan(addon, with_runs).button == "Continue Training", "the run that is there is of the preset that is chosen"
     props.preset = "final"
-    assert plan(addon, with_runs).kind == "resume" and "as it was" in plan(addon, with_runs).words
+    assert plan(addon, with_runs).kind == "resume" and "does not change" in plan(addon, with_runs).words
     asked = addon("process.steps").STEPS["train"].params(with_runs)
     assert (asked.run, asked.preset, asked.seed, asked.iterations, asked.extend) == ("main", "final", 9, 900, 0)
 

@@ -35,7 +35,7 @@ def test_the_scale_is_guessed_from_the_cameras_height(addon, scene, shot, height
     with_floor(shot, height, sway=0.05)
     scene.splannequin.shot_path, scene.unit_settings.scale_length = str(shot), unit
     said = addon("solve.arrival").load_camera(scene, shot)
-    assert any("is a guess: the camera stands 1.5 m above" in line for line in said)
+    assert any("is estimated: the camera is 1.5 m above" in line for line in said)
     assert np.median(heights(addon, scene, shot)) == pytest.approx(1.5 * 0.95, rel=0.06)
     operators = addon("solve.scale")
     assert not operators.scaled(scene, shot) and operators.guessed_scale(scene, shot) > 0

@@ -136,7 +136,9 @@ def test_cameras_that_cannot_be_the_clips_are_refused(addon, contract, chosen, s
     with pytest.raises(contract.JobError, match="No camera of the scene is chosen"):
         solve.params(chosen)
     props.scene_camera, chosen.render.resolution_x = camera, 1920
-    with pytest.raises(contract.JobError, match="renders 1920 x 1200 pixels, the clip has another shape, 16 x 12"):
+    with pytest.raises(
+        contract.JobError, match="renders 1920 x 1200 pixels, but the clip has a different aspect ratio, 16 x 12"
+    ):
         solve.params(chosen)
     assert not (shot / "tracking").exists()
 

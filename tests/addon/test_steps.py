@@ -43,7 +43,7 @@ def test_an_import_with_a_start_counts_from_it(addon, scene, clip, tmp_path):
 def test_a_scene_in_use_is_left_alone_without_consent(addon, scene, shot):
     scene.render.resolution_x, scene.frame_end = 4096, 99
     said = addon("footage.arrival").imported(scene, shot)
-    assert (scene.render.resolution_x, scene.frame_end) == (4096, 99) and "left alone" in said[0]
+    assert (scene.render.resolution_x, scene.frame_end) == (4096, 99) and "not changed" in said[0]
     scene.splannequin.set_up_scene = True
     addon("footage.arrival").imported(scene, shot)
     assert (scene.render.resolution_x, scene.frame_end) == (16, 7)
@@ -71,7 +71,7 @@ def test_no_backend_writes_nothing(addon, scene, clip, tmp_path, monkeypatch):
 
 def test_a_folder_of_no_shot_is_refused(scene, tmp_path):
     scene.splannequin.shot_path = str(tmp_path)
-    with pytest.raises(RuntimeError, match="is no shot folder"):
+    with pytest.raises(RuntimeError, match="is not a shot folder"):
         bpy.ops.splannequin.solve_camera()
 
 
@@ -204,8 +204,8 @@ def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
     steps, state = addon("process.steps").STEPS, addon("shot.inventory").read(shot)
     shown = {name: step.view(with_shot, state) for name, step in steps.items()}
     assert shown["import"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
-    assert shown["solve"].state == ["A good solve."] and "load it" in shown["solve"].advice
-    assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % may move"]
+    assert shown["solve"].state == ["A good solve."] and "Load the camera" in shown["solve"].advice
+    assert shown["train"].state == ["Run main: 24.0 dB on held-out frames", "12,345 Gaussians, 5.0 % may move"]
     assert shown["freeze"].state == ["Time stands still at frame 6", "Take freeze: 3 frames, 16 x 12"]
     assert not shown["bake"].done and shown["bake"].ready
 
@@ -257,9 +257,9 @@ def test_broken_points_are_told_in_a_sentence(addon, scene, shot):
         points.write_bytes(data)
         with pytest.raises(RuntimeError) as told:
             bpy.ops.splannequin.load_camera()
-        assert str(told.value).strip() == f"Error: {points} is damaged: solve again."
-    german = addon("translations").translate(f"{points} is damaged: solve again.", "de_DE")
-    assert german == f"{points} ist beschädigt: die Kamera neu lösen."
+        assert str(told.value).strip() == f"Error: {points} is damaged. Solve again."
+    german = addon("translations").translate(f"{points} is damaged. Solve again.", "de_DE")
+    assert german == f"{points} ist beschädigt. Die Kamera neu lösen."
     points.write_bytes(whole)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
 
@@ -328,7 +328,7 @@ def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_wi
     assert not replaces(a_few), "the same clip again"
     props.clip = str(tmp_path / "B" / "shot.mp4")
     told = replaces(a_few)
-    assert told.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}: its frames")
+    assert told.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}. Its frames")
     assert addon("translations").translate(told, "de_DE").startswith("own.splannequin ist der Shot von ")
     props.clip = ""
     assert not replaces(a_few), "its own clip is taken"
@@ -405,7 +405,7 @@ def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path
 def test_a_view_that_the_colour_configuration_lacks_is_said(addon, contract, scene, monkeypatch):
     setup = addon("scene.scene_setup")
     monkeypatch.setattr(setup, "NEUTRAL_VIEWS", ("Plain",))
-    with pytest.raises(contract.JobError, match=r"no view that leaves colours alone \(Plain\)"):
+    with pytest.raises(contract.JobError, match=r"no view that keeps colours unchanged \(Plain\)"):
         setup.keep_plate_colours(scene)
     assert scene.view_settings.view_transform == "AgX"
 

@@ -195,7 +195,7 @@ def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp
     assert backend.python() == str(python), "somebody's own environment has no notes of ours, and is believed"
     notes = tmp_path / ".venv" / ".splannequin"
     notes.mkdir()
-    refused = "The backend's set-up has not finished"
+    refused = "The backend's set-up did not finish"
     # named explicitly, so that no other environment is used instead
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(python))
 
@@ -206,7 +206,7 @@ def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp
         assert trouble.exit_code == contract.ExitCode.ENVIRONMENT and "Press Repair" in trouble.hint
         return trouble.message
 
-    assert said() == f"{refused}: the environment in {tmp_path / '.venv'} is half-made."
+    assert said() == f"{refused}. The environment in {tmp_path / '.venv'} is incomplete."
     (notes / "installing").touch()
     assert refused in said()
     (notes / "installed.json").write_text("{}")

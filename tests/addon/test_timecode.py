@@ -37,7 +37,7 @@ def test_the_panel_says_the_timecode_of_the_current_frame(addon, dated):
 
 def test_what_is_rendered_tells_it_and_removal_takes_it_back(addon, dated, tmp_path):
     scene, shot = dated("01:00:00:10")
-    assert f"What is rendered says in its metadata (Note): {NOTE}" in addon("bake.insertion").insert_freeze(
+    assert f"Note in the metadata of rendered images: {NOTE}" in addon("bake.insertion").insert_freeze(
         scene, shot, "freeze"
     )
     settings = scene.render.image_settings

@@ -178,8 +178,8 @@ def test_composed_sentences_are_translated_with_their_values(addon):
     german = [
         ("Import Clip", "Clip importieren"),
         ("74 frames, 1 to 74", "74 Bilder, 1 bis 74"),
-        ("Run main: no frames kept out", "Lauf main: keine Bilder zurückgehalten"),
-        ("Run main: 24.1 dB on frames kept out", "Lauf main: 24.1 dB auf zurückgehaltenen Bildern"),
+        ("Run main: no held-out frames", "Lauf main: keine Bilder zurückgehalten"),
+        ("Run main: 24.1 dB on held-out frames", "Lauf main: 24.1 dB auf zurückgehaltenen Bildern"),
         ("Solve: features 12 %", "Kameralösung: Merkmale 12 %"),
         ("Good: 40 of 41 frames registered, 0.52 px.", "Gut: 40 von 41 Bildern gelöst, 0.52 px."),
         (

@@ -62,7 +62,7 @@ def test_what_cannot_be_aligned_is_said(maths, contract):
     with pytest.raises(contract.JobError, match="the same"):
         maths.scaled(np.ones((2, 3)), 1.0)
     for distance in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(contract.JobError, match="above 0"):
+        with pytest.raises(contract.JobError, match="greater than 0"):
             maths.scaled(np.eye(3)[:2], distance)
 
 
