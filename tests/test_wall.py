@@ -133,13 +133,13 @@ def imported(path: Path) -> list[tuple[int, str]]:
 
 
 LAYOUT = {
-    value
-    for name, told in vars(shot_folder).items()
+    name_of_file
+    for name, value in vars(shot_folder).items()
     if name.endswith(("_FILE", "_FILES", "_FOLDER", "_LOG", "_SUFFIX"))
-    for value in (told if isinstance(told, tuple) else (told,))
+    for name_of_file in (value if isinstance(value, tuple) else (value,))
 }
 """Names in a shot folder, as spelled in the contract."""
-OTHER_FOLDERS = {
+FOREIGN_NAMES = {
     ("splannequin_addon/process/environment.py", "summary.json"),  # of the launcher, in an environment
     ("splannequin_addon/process/environment.py", ".splannequin"),
     ("torch_backend/cameras/imported.py", "colmap/sparse/0"),  # of another program
@@ -327,7 +327,7 @@ def test_only_the_contract_spells_the_layout_of_a_shot():
     for path in [*sources("splannequin_addon"), *sources("torch_backend")]:
         file = path.relative_to(ROOT).as_posix()
         found = layout_names(read(path)) if contract not in path.parents else ()
-        wrong += [f"{file}:{line}: {name}" for line, name in found if (file, name) not in OTHER_FOLDERS]
+        wrong += [f"{file}:{line}: {name}" for line, name in found if (file, name) not in FOREIGN_NAMES]
     assert not wrong, "ask contract.ShotFolder, RunFolder or TakeFolder for these paths"
 
 
@@ -343,7 +343,7 @@ def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
         return found
 
     beyond = {name: reached(name) for name in arrows}
-    groups = {frozenset(other for other in beyond[name] if name in beyond[other]) for name in arrows}
+    groups = {frozenset(reachable for reachable in beyond[name] if name in beyond[reachable]) for name in arrows}
     return sorted(sorted(group) for group in groups if group)
 
 
@@ -385,21 +385,21 @@ def addon_modules() -> dict[str, set[str]]:
 
 def level(module: str, arrows: dict[str, set[str]]) -> int:
     """Length of the longest chain of imports that starts with this module, which counts as one."""
-    return 1 + max((level(other, arrows) for other in arrows[module]), default=0)
+    return 1 + max((level(imported_module, arrows) for imported_module in arrows[module]), default=0)
 
 
 def backwards(arrows: dict[str, set[str]]) -> list[str]:
     """Imports from a room to one that does not come before it."""
     order = {room: place for place, room in enumerate(ROOMS)}
     wrong = []
-    for module, others in arrows.items():
-        here = module.partition(".")[0]
-        for other in sorted(others):
-            there = other.partition(".")[0]
-            if here != there and order[there] >= order[here]:
-                wrong.append(f"{module} imports {other}")
-            if other.endswith(".step") and here != "registration":
-                wrong.append(f"{module} imports {other}, which only the registration does")
+    for module, targets in arrows.items():
+        source_room = module.partition(".")[0]
+        for target in sorted(targets):
+            target_room = target.partition(".")[0]
+            if source_room != target_room and order[target_room] >= order[source_room]:
+                wrong.append(f"{module} imports {target}")
+            if target.endswith(".step") and source_room != "registration":
+                wrong.append(f"{module} imports {target}, which only the registration does")
     return wrong
 
 
@@ -467,11 +467,11 @@ def test_no_files_and_folders_of_a_package_import_each_other(package: str):
     arrows: dict[str, set[str]] = {}
     for path in sources(package.replace(".", "/")):
         module = [*package_of(path), *([] if path.stem == "__init__" else [path.stem])]
-        own = part_of(".".join(module), package)
-        if own:
+        part = part_of(".".join(module), package)
+        if part:
             names = (part_of(name, package) for _, name in imported(path))
-            arrows.setdefault(own, set()).update(names)
-    arrows = {own: {name for name in names if name in arrows and name != own} for own, names in arrows.items()}
+            arrows.setdefault(part, set()).update(names)
+    arrows = {part: {name for name in names if name in arrows and name != part} for part, names in arrows.items()}
     assert circles(arrows) == []
 
 

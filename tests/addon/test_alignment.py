@@ -129,8 +129,8 @@ def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, 
     addon("bake.insertion").insert_freeze(built, shot, "freeze")
     assert addon("bake.freeze_group").shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
     places = world(addon, built, shot)[[0, 1]]
-    apart = float(np.linalg.norm(places[1] - places[0]))
-    bpy.ops.splannequin.align_scale(places=places.ravel(), distance=3 * apart)
+    distance = float(np.linalg.norm(places[1] - places[0]))
+    bpy.ops.splannequin.align_scale(places=places.ravel(), distance=3 * distance)
     assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not addon(
         "bake.shown_take"
     ).stale_scale(built, shot)

@@ -34,9 +34,9 @@ def ended_job(addon, contract, watch, step, state="done"):
     watch.jobs[step] = job
 
 
-def begun(chain, watch, ahead, step="solve"):
-    """Register a chain of steps with `step` running and `ahead` still to run."""
-    found = chain.Chain(list(ahead), chain.contract.WholeWay({}), step)
+def begun(chain, watch, pending, step="solve"):
+    """Register a chain of steps with `step` running and `pending` still to run."""
+    found = chain.Chain(list(pending), chain.contract.WholeWay({}), step)
     chain._chains[watch.shot] = found
     return found
 

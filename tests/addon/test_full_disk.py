@@ -14,8 +14,8 @@ def small_disk(tmp_path: Path):
     """A file system of 8 MB."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(disk)], capture_output=True)
-    if sys.platform != "linux" or made.returncode:
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(disk)], capture_output=True)
+    if sys.platform != "linux" or mounted.returncode:
         pytest.skip("mounting needs Linux and root")
     yield disk
     subprocess.run(["umount", "-l", str(disk)], check=True)

@@ -32,18 +32,18 @@ def test_scrubbing(addon, trap, shot, root):
 
 
 def test_st_maps(addon, contract, trap, shot):
-    asked = addon("solve.stmaps").begin(shot)
-    asked.wait()
+    question = addon("solve.stmaps").begin(shot)
+    question.wait()
     with pytest.raises(contract.JobError):  # the shot has no lens distortion
-        addon("solve.stmaps").answer(asked)
+        addon("solve.stmaps").answer(question)
     assert not trap.exists(), trap.read_text()
 
 
 def test_exported_cameras(addon, contract, trap, shot):
     solves = addon("solve.exchange")
     words = contract.ExportWords(shot=str(shot), format="nerfstudio", output=str(shot / "out"))
-    asked = solves.begin_export(words)
-    assert str(shot / "out") in solves.exported(asked, shot / "out")
+    question = solves.begin_export(words)
+    assert str(shot / "out") in solves.exported(question, shot / "out")
     assert (shot / "out" / "transforms.json").is_file()
     assert not trap.exists(), trap.read_text()
 

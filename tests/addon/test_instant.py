@@ -43,10 +43,10 @@ def test_the_second_shot_of_the_list_starts_at_its_current_frame_too(with_shot, 
     assert with_shot.splannequin.t_star == 6
 
 
-@pytest.mark.parametrize(("asked", "held"), [(411, 7), (-3, 5), (6, 6)])
-def test_t_star_is_held_within_the_clip(with_shot, asked, held):
-    with_shot.splannequin.t_star = asked
-    assert with_shot.splannequin.t_star == held
+@pytest.mark.parametrize(("requested", "clamped"), [(411, 7), (-3, 5), (6, 6)])
+def test_t_star_is_held_within_the_clip(with_shot, requested, clamped):
+    with_shot.splannequin.t_star = requested
+    assert with_shot.splannequin.t_star == clamped
 
 
 def test_a_take_is_done_while_it_is_what_freeze_would_make_now(addon, with_shot, shot):

@@ -42,8 +42,8 @@ def test_polygons_are_what_blender_renders_of_a_mask(addon, shot, handle, size):
     corners = [(30.0, 20.0), (70.0, 25.0), (80.0, 70.0), (25.0, 60.0)]
     mask = mask_of("thing", corners, width, height, handle)
     listing = shot / "frames" / "frames.json"
-    told = json.loads(listing.read_text())
-    listing.write_text(json.dumps({**told, "width": width, "height": height}))
+    polygons = json.loads(listing.read_text())
+    listing.write_text(json.dumps({**polygons, "width": width, "height": height}))
     file = addon("solve.drawn_masks").render(mask, shot, "people") / "000006.png"
     rendered = read(file)[..., 0] > 0.5
     (polygon,) = addon("freeze.mattes").polygons(mask, width, height)
@@ -60,9 +60,9 @@ def test_polygons_are_what_blender_renders_of_a_mask(addon, shot, handle, size):
 @pytest.fixture(scope="module")
 def world(frozen_world):
     """A frozen take of the backend's tiny world: (shot folder, masks by frame, outline at frame 107)."""
-    told = json.loads((frozen_world / "truth.json").read_text())
-    masks = {int(frame): np.array(mask, bool) for frame, mask in told["masks"].items()}
-    return frozen_world / "tiny.splannequin", masks, told["outline"]
+    truth = json.loads((frozen_world / "truth.json").read_text())
+    masks = {int(frame): np.array(mask, bool) for frame, mask in truth["masks"].items()}
+    return frozen_world / "tiny.splannequin", masks, truth["outline"]
 
 
 @pytest.fixture

@@ -92,8 +92,8 @@ def shown(scene, folder: Path, side: int) -> dict[tuple[int, int, int], np.ndarr
 
 
 def test_cycles_shows_every_direction_in_its_colour_and_follows_the_root(scene, shot, lit, addon, tmp_path):
-    told = add(addon, scene, shot)
-    assert "40 %" in told[0]
+    light_facts = add(addon, scene, shot)
+    assert "40 %" in light_facts[0]
     for axis, light in shown(scene, tmp_path, 1).items():
         np.testing.assert_allclose(light, COLORS[axis], atol=0.01, err_msg=str(axis))
     turn = Quaternion((1, 1, 1), 2 * np.pi / 3)  # +X becomes +Y, +Y becomes +Z, +Z becomes +X
@@ -136,13 +136,13 @@ def test_a_world_that_was_chosen_since_stays(scene, shot, lit, addon):
 def test_two_shots_take_turns(scene, shot, lit, addon, contract, tmp_path):
     mine, lights = scene.world, addon("freeze.lights")
     add(addon, scene, shot)
-    other = tmp_path / "other.splannequin"
-    shutil.copytree(shot, other)
-    scene.splannequin.shot_path = str(other)
+    second_shot = tmp_path / "other.splannequin"
+    shutil.copytree(shot, second_shot)
+    scene.splannequin.shot_path = str(second_shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
-    add(addon, scene, other)
-    assert scene.world == lights.find(scene, other) != lights.find(scene, shot)
-    lights.remove(scene, other)
+    add(addon, scene, second_shot)
+    assert scene.world == lights.find(scene, second_shot) != lights.find(scene, shot)
+    lights.remove(scene, second_shot)
     assert scene.world == lights.find(scene, shot)
     lights.remove(scene, shot)
     assert scene.world == mine

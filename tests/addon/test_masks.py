@@ -33,8 +33,8 @@ def test_the_solve_is_asked_for_the_masks_that_are_chosen(addon, contract, scene
     with pytest.raises(contract.JobError, match="Nothing is chosen for the mask Ignore"):
         step.params(scene)
     props.ignore_path = str(tmp_path / "x" / ".." / "logo.png")
-    asked = step.params(scene)
-    assert (asked.ignore_mask, asked.people_mask) == (str(tmp_path / "logo.png"), "alpha")
+    params = step.params(scene)
+    assert (params.ignore_mask, params.people_mask) == (str(tmp_path / "logo.png"), "alpha")
     props.ignore_from = props.people_from = "NONE"
     assert step.params(scene) == contract.SolveParams(ignore_mask="")
     props.people_from = "DRAWN"
@@ -58,9 +58,9 @@ def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file
     (shot / "masks" / "people").mkdir(parents=True)
     (shot / "masks" / "people" / "000099.png").write_bytes(b"of another range")
     before = {kind: len(getattr(bpy.data, kind)) for kind in ("scenes", "objects", "cameras", "node_groups", "images")}
-    asked = addon("process.steps").STEPS["solve"].params(scene)
-    assert Path(asked.people_mask) == shot / "masks" / "people"
-    assert sorted(p.name for p in Path(asked.people_mask).iterdir()) == ["000005.png", "000006.png", "000007.png"]
+    params = addon("process.steps").STEPS["solve"].params(scene)
+    assert Path(params.people_mask) == shot / "masks" / "people"
+    assert sorted(p.name for p in Path(params.people_mask).iterdir()) == ["000005.png", "000006.png", "000007.png"]
     found = read(shot / "masks" / "people" / "000006.png")[..., 0]
     listing = json.loads((shot / "frames" / "frames.json").read_text())
     assert found.shape == (listing["height"], listing["width"])
@@ -103,15 +103,15 @@ def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_a
 
 def test_what_a_killed_blender_left_of_a_mask_is_removed_by_the_next_one_and_a_living_ones_stays(addon, shot, drawn):
     into, masks = shot / "masks" / "people", addon("solve.drawn_masks")
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
-        half, ours = masks._beside(into, other.pid), masks._beside(into.with_name("ignore"), os.getpid())
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        half, ours = masks._beside(into, process.pid), masks._beside(into.with_name("ignore"), os.getpid())
         kept = [ours, into.with_name(".people"), into.with_name(".people-1")]
         for folder in (half, *kept):
             folder.mkdir(parents=True)
             (folder / "000005.png").write_bytes(b"half of all")
         masks.render(drawn, shot, "people")
         assert (half / "000005.png").is_file(), "it is at work"
-        other.kill()
+        process.kill()
     masks.render(drawn, shot, "people")
     assert sorted(p for p in into.parent.iterdir()) == sorted([*kept, into])
     assert len(list(into.iterdir())) == 3
@@ -191,8 +191,8 @@ def test_a_mask_follows_its_clip_wherever_the_project_lies(addon, scene, shot, t
     named = "/old/place/plates/take.1001.png" if how == "moved" else str(plates / "take.1001.png")
     info, listing = shot / "shot.json", shot / "frames" / "frames.json"
     info.write_text(json.dumps({**json.loads(info.read_text()), "source": named}))
-    beside = os.path.relpath(plates / "take.1001.png", shot)
-    listing.write_text(json.dumps({**json.loads(listing.read_text()), "beside": beside}))
+    relative_path = os.path.relpath(plates / "take.1001.png", shot)
+    listing.write_text(json.dumps({**json.loads(listing.read_text()), "beside": relative_path}))
     opened = plates / "take.1001.png"
     if how == "linked":
         (tmp_path / "link").symlink_to(tmp_path / "project")

@@ -92,9 +92,9 @@ def test_without_mattes_or_camera_it_says_so(addon, scene, shot):
 
 
 def test_nothing_is_written_through_a_link(addon, scene, loaded, tmp_path):
-    motion, elsewhere = loaded / "solve" / "motion", tmp_path / "elsewhere"
-    motion.rename(elsewhere)
-    motion.symlink_to(elsewhere, target_is_directory=True)
+    motion, target = loaded / "solve" / "motion", tmp_path / "elsewhere"
+    motion.rename(target)
+    motion.symlink_to(target, target_is_directory=True)
     with pytest.raises(RuntimeError, match="Cannot write"):
         bpy.ops.splannequin.motion_over_plate()
-    assert not (elsewhere / "overlay").exists()
+    assert not (target / "overlay").exists()

@@ -35,10 +35,10 @@ def test_near_the_clips_path_little_is_a_guess_and_turned_away_all_of_it_is(addo
     shares = found(addon, scene, world, move.name)
     assert list(shares) == list(range(101, 117)) and scene.frame_current == 103
     assert np.mean(list(shares.values())) < 0.3
-    away = bpy.data.objects.new("away", move.data)
-    scene.collection.objects.link(away)
+    turned_camera = bpy.data.objects.new("away", move.data)
+    scene.collection.objects.link(turned_camera)
     scene.frame_set(105)
-    away.matrix_world = move.matrix_world @ Matrix.Rotation(np.pi, 4, "Y")
+    turned_camera.matrix_world = move.matrix_world @ Matrix.Rotation(np.pi, 4, "Y")
     bpy.context.view_layer.update()
     assert min(found(addon, scene, world, "away").values()) > 0.95
 

@@ -55,8 +55,8 @@ def test_a_bake_follows_the_keys_of_t_star_as_they_are_now(addon, with_shot, sho
     with_shot.keyframe_insert("splannequin.t_star", frame=5)
     props.t_star = 7
     with_shot.keyframe_insert("splannequin.t_star", frame=7)
-    asked = steps.STEPS["bake"].params(with_shot).t_star_per_frame
-    assert asked["5"] == 5.0 and asked["7"] == 7.0
+    requested = steps.STEPS["bake"].params(with_shot).t_star_per_frame
+    assert requested["5"] == 5.0 and requested["7"] == 7.0
 
 
 def test_complete_is_about_the_frames_that_are_asked_for(addon, shot):
@@ -124,11 +124,11 @@ def test_headless_bakes_a_part_of_a_take_and_leaves_it_in_the_file(addon, shot, 
 def larger_plate(shot, times: int) -> None:
     """Enlarge the shot's recorded plate size and camera intrinsics `times` times."""
     for name in ("shot.json", "solve/cameras.json"):
-        told = json.loads((shot / name).read_text())
-        told |= {"width": 16 * times, "height": 12 * times}
-        for frame in told.get("frames", []):
+        facts = json.loads((shot / name).read_text())
+        facts |= {"width": 16 * times, "height": 12 * times}
+        for frame in facts.get("frames", []):
             frame["K"] = [times * value for value in frame["K"]]
-        (shot / name).write_text(json.dumps(told))
+        (shot / name).write_text(json.dumps(facts))
 
 
 def size_of(scene) -> tuple[int, int, int]:

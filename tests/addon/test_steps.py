@@ -241,9 +241,9 @@ def test_no_button_meets_a_newer_or_damaged_shot_with_a_traceback(scene, shot, t
         (shot / "shot.json").write_text(text)
         assert not bpy.ops.splannequin.export_for_farm.poll()
         for name in ("bake", "freeze", "solve_camera", "train", "import_clip"):
-            with pytest.raises(RuntimeError) as told:
+            with pytest.raises(RuntimeError) as error:
                 getattr(bpy.ops.splannequin, name)()
-            assert "Traceback" not in str(told.value), name
+            assert "Traceback" not in str(error.value), name
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -255,9 +255,9 @@ def test_broken_points_are_told_in_a_sentence(addon, scene, shot):
     np.savez(archive, other=np.zeros(3))
     for data in (whole[: len(whole) // 2], b"", b"no archive", archive.getvalue()):
         points.write_bytes(data)
-        with pytest.raises(RuntimeError) as told:
+        with pytest.raises(RuntimeError) as error:
             bpy.ops.splannequin.load_camera()
-        assert str(told.value).strip() == f"Error: {points} is damaged: solve again."
+        assert str(error.value).strip() == f"Error: {points} is damaged: solve again."
     german = addon("translations").translate(f"{points} is damaged: solve again.", "de_DE")
     assert german == f"{points} ist beschädigt: die Kamera neu lösen."
     points.write_bytes(whole)
@@ -327,9 +327,9 @@ def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_wi
     imported(addon, a_few, clip, tmp_path / "A" / "shot.mp4")
     assert not replaces(a_few), "the same clip again"
     props.clip = str(tmp_path / "B" / "shot.mp4")
-    told = replaces(a_few)
-    assert told.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}: its frames")
-    assert addon("translations").translate(told, "de_DE").startswith("own.splannequin ist der Shot von ")
+    question = replaces(a_few)
+    assert question.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}: its frames")
+    assert addon("translations").translate(question, "de_DE").startswith("own.splannequin ist der Shot von ")
     props.clip = ""
     assert not replaces(a_few), "its own clip is taken"
 
@@ -339,8 +339,8 @@ def test_work_on_a_shot_is_replaced_with_consent_alone(addon, a_few, clip, tmp_p
     folder = imported(addon, a_few, clip, tmp_path / "a.mp4")
     (folder / "solve").mkdir()
     (folder / "solve" / "cameras.json").write_text("{}")
-    told = addon("footage.operators").replaces(a_few)
-    assert "a solved camera" in told and "gelöste Kamera" in addon("translations").translate(told, "de_DE")
+    question = addon("footage.operators").replaces(a_few)
+    assert "a solved camera" in question and "gelöste Kamera" in addon("translations").translate(question, "de_DE")
     a_few.splannequin.use_range, a_few.splannequin.first, a_few.splannequin.last = True, 3, 12
     with pytest.raises(RuntimeError, match="--replace"):
         bpy.ops.splannequin.import_clip()
@@ -441,9 +441,9 @@ def test_marker_and_instant_follow_whichever_changed_last(addon, with_shot, shot
     scene.name = "renamed"
     marker.frame = 7
     assert markers.follow(scene) and scene.splannequin.t_star == 7, "known by another name"
-    other = scene.timeline_markers.new("mine", frame=3)
+    artists_marker = scene.timeline_markers.new("mine", frame=3)
     assert "The marker t* was removed." in addon("process.begin").remove_all(scene, shot)
-    assert list(scene.timeline_markers) == [other]
+    assert list(scene.timeline_markers) == [artists_marker]
 
 
 def test_what_the_artist_changed_since_is_not_taken_back(addon, scene, shot):

@@ -39,8 +39,8 @@ def stood(scene, shot, addon, contract):
     root.matrix_world = Matrix.LocRotScale(Vector((3, -2, 1)), Matrix.Rotation(0.7, 3, "X"), Vector((2.5,) * 3))
     bpy.context.view_layer.update()
     facts = shot / "takes/freeze/take.json"
-    told = addon("shot.placement").placement_in(scene, shot).to_json()
-    facts.write_text(json.dumps({**json.loads(facts.read_text()), "placement": told}))
+    placement = addon("shot.placement").placement_in(scene, shot).to_json()
+    facts.write_text(json.dumps({**json.loads(facts.read_text()), "placement": placement}))
     write_surface(shot, contract)
     addon("process.job_timer").watch_of(shot).state = addon("shot.inventory").read(shot)
     return root
@@ -108,17 +108,17 @@ def test_what_the_artist_deletes_is_let_go(scene, shot, stood, addon):
 
 def test_two_shots_of_a_file_have_their_own(scene, shot, stood, addon, contract, tmp_path):
     bpy.ops.splannequin.add_surface()
-    other = tmp_path / "other.splannequin"
-    shutil.copytree(shot, other)
-    scene.splannequin.shot_path = str(other)
+    second_shot = tmp_path / "other.splannequin"
+    shutil.copytree(shot, second_shot)
+    scene.splannequin.shot_path = str(second_shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
-    write_surface(other, contract)
-    addon("process.job_timer").watch_of(other).state = addon("shot.inventory").read(other)
+    write_surface(second_shot, contract)
+    addon("process.job_timer").watch_of(second_shot).state = addon("shot.inventory").read(second_shot)
     assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
-    first, second = found(addon, scene, shot), found(addon, scene, other)
+    first, second = found(addon, scene, shot), found(addon, scene, second_shot)
     assert len(first) == len(second) == 2 and not set(first) & set(second)
-    addon("freeze.surfaces").remove(scene, other)
-    assert len(found(addon, scene, shot)) == 2 and not found(addon, scene, other)
+    addon("freeze.surfaces").remove(scene, second_shot)
+    assert len(found(addon, scene, shot)) == 2 and not found(addon, scene, second_shot)
 
 
 def test_a_render_has_the_shadow_and_what_is_behind_people_is_hidden(scene, shot, stood, addon, tmp_path):

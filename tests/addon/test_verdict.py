@@ -87,11 +87,11 @@ def test_detail_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon,
 
 def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
     steps, props, take = addon("process.steps"), with_shot.splannequin, shot / "takes" / "freeze" / "take.json"
-    asked = []
+    requests = []
     for wanted in (True, False):
         props.develop = wanted
-        asked.append(steps.STEPS["freeze"].params(with_shot).develop)
-    assert asked == ["on", "off"]
+        requests.append(steps.STEPS["freeze"].params(with_shot).develop)
+    assert requests == ["on", "off"]
     props.develop = True
     assert steps.STEPS["bake"].params(with_shot).develop == "off", "its frames are of before instants were developed"
     props.develop = False

@@ -106,10 +106,10 @@ def test_hosts_are_known_by_their_files_alone(capsys):
 
 
 @pytest.mark.parametrize(
-    "made", ['HOST = HostSpec("fourth", Config)', 'HOST: HostSpec = HostSpec(\n    config=Config, name="fourth")']
+    "line", ['HOST = HostSpec("fourth", Config)', 'HOST: HostSpec = HostSpec(\n    config=Config, name="fourth")']
 )
-def test_a_host_is_known_however_its_file_names_it(tmp_path, made):
-    (tmp_path / "fourth.py").write_text(f"from .protocol import HostSpec\n\n{made}\n", encoding="utf-8")
+def test_a_host_is_known_however_its_file_names_it(tmp_path, line):
+    (tmp_path / "fourth.py").write_text(f"from .protocol import HostSpec\n\n{line}\n", encoding="utf-8")
     (tmp_path / "protocol.py").write_text("HOSTS = ('none',)\nHOST_WORDS = dict(name='none')\n", encoding="utf-8")
     assert host_names(tmp_path) == ("fourth",)
 

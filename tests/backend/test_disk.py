@@ -54,9 +54,9 @@ def test_a_checkpoint_that_does_not_fit_ends_the_job_in_words(world, disk):
     shot = Shot(shutil.copytree(world.shot.root, folder / "s.splannequin", ignore=ignored))
 
     def train(listener, **changes):
-        asked = job.new_job(shot, "train", TrainParams(iterations=60, max_gaussians=1500, **changes))
-        code, _ = job.run_job(asked, listener)
-        return code, contract.from_dict(contract.Status, contract.read_json(asked / contract.STATUS_FILE))
+        folder_of_job = job.new_job(shot, "train", TrainParams(iterations=60, max_gaussians=1500, **changes))
+        code, _ = job.run_job(folder_of_job, listener)
+        return code, contract.from_dict(contract.Status, contract.read_json(folder_of_job / contract.STATUS_FILE))
 
     events = []
     assert train(events.append)[0] == ExitCode.OK

@@ -50,10 +50,10 @@ def test_threads_and_numbers_are_those_of_each_call():
     launch_on(KERNEL, 2, [out.data_ptr(), 1.0], CPU)
     launch_on(KERNEL, 6, [out.data_ptr(), 2.0], CPU)
     launch_on(KERNEL, 0, [out.data_ptr(), 64.0], CPU)
-    other = torch.zeros(3)
-    launch_on(KERNEL, 3, [other.data_ptr(), 8.0], CPU)
+    second = torch.zeros(3)
+    launch_on(KERNEL, 3, [second.data_ptr(), 8.0], CPU)
     launch_on(KERNEL, 1, [out.data_ptr(), 16.0], CPU)
-    assert out.tolist() == [19.0, 3.0, 2.0, 2.0, 2.0, 2.0] and other.tolist() == [8.0, 8.0, 8.0]
+    assert out.tolist() == [19.0, 3.0, 2.0, 2.0, 2.0, 2.0] and second.tolist() == [8.0, 8.0, 8.0]
 
 
 def test_threads_of_python_launch_beside_each_other():
@@ -166,16 +166,16 @@ def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
         time.sleep(0.1)
         signal.pthread_kill(main, signal.SIGINT)
 
-    other = threading.Thread(target=interrupt)
+    thread = threading.Thread(target=interrupt)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     try:
-        other.start()
+        thread.start()
         with pytest.raises(KeyboardInterrupt):
             run_workers(run, Block(), 0, 3)
     finally:
         signal.signal(signal.SIGINT, before)
     assert begun and sorted(begun) == sorted(ended)
-    other.join()
+    thread.join()
 
 
 def test_a_caller_does_itself_what_no_worker_has_begun():
@@ -210,8 +210,8 @@ def interrupted_at(step, work):
         return look
 
     before = sys.gettrace()
-    own = native.__file__
-    sys.settrace(lambda frame, event, arg: look(frame, event, arg) if frame.f_code.co_filename == own else None)
+    module_file = native.__file__
+    sys.settrace(lambda frame, event, arg: look(frame, event, arg) if frame.f_code.co_filename == module_file else None)
     try:
         work()
     except KeyboardInterrupt:

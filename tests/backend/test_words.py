@@ -173,9 +173,9 @@ def test_a_request_of_blender_gets_the_same_sentences(place, kind, params, word)
         code = done.returncode
     else:
         code, _ = job.run_job(folder)
-    told = json.loads((folder / contract.STATUS_FILE).read_text())["message"]
+    message = json.loads((folder / contract.STATUS_FILE).read_text())["message"]
     assert code == ExitCode.USAGE
-    assert re.search(word, told), told
+    assert re.search(word, message), message
 
 
 def test_the_limits_are_of_fields_that_there_are_and_hold_their_defaults():

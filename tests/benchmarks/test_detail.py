@@ -83,9 +83,9 @@ def test_still_is_far_from_movers_and_known():
     matte[:, 50:] = 128 / 255  # unknown
     still = still_pixels(matte)
     assert not still[:, :18].any() and still[:, 18:50].all() and not still[:, 50:].any()
-    elsewhere = torch.zeros(40, 60, dtype=torch.bool)
-    elsewhere[20, 30] = True
-    still = still_pixels(matte, elsewhere)
+    unknown = torch.zeros(40, 60, dtype=torch.bool)
+    unknown[20, 30] = True
+    still = still_pixels(matte, unknown)
     assert not still[12:29, 22:39].any() and still[11, 30] and still[20, 39]
 
 
@@ -97,16 +97,16 @@ def test_points_are_seen_where_the_other_camera_has_them():
     turn = 0.1
     b[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
     a[:3, 3], b[:3, 3] = [0.1, 0.0, 0.3], [-0.2, 0.05, -0.1]
-    places, there = induced_places(*(torch.from_numpy(v) for v in (depth, a, K, b, 2 * K)))
+    places, is_inside = induced_places(*(torch.from_numpy(v) for v in (depth, a, K, b, 2 * K)))
     for y, x in ((0, 0), (3, 5), (5, 7)):
         point = np.linalg.inv(K) @ [x + 0.5, y + 0.5, 1.0] * depth[y, x]
         point = b @ np.linalg.inv(a) @ [*point, 1.0]
         seen = 2 * K @ point[:3]
         np.testing.assert_allclose(places[y, x], seen[:2] / seen[2], atol=2e-4)
-        assert there[y, x] == pytest.approx(point[2], abs=1e-5)
+        assert is_inside[y, x] == pytest.approx(point[2], abs=1e-5)
     b[2, 3] = -100.0
-    places, there = induced_places(*(torch.from_numpy(v) for v in (depth, a, K, b, K)))
-    assert (there < 0).all() and not inside(places, 8, 6).any()
+    places, is_inside = induced_places(*(torch.from_numpy(v) for v in (depth, a, K, b, K)))
+    assert (is_inside < 0).all() and not inside(places, 8, 6).any()
 
 
 def test_what_another_surface_hides_is_not_seen_again(grid):

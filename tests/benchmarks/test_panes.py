@@ -44,8 +44,8 @@ def with_board(world: Geometry, moved: list[float]) -> Geometry:
 
 def view(yaw: float = 0.0, eye: np.ndarray = EYE) -> View:
     """View along y, rotated to the right by `yaw` radians."""
-    ahead = np.array([np.sin(yaw), np.cos(yaw), 0.0])
-    return View(_look_at(eye, eye + ahead, np.zeros(3)), intrinsics(160, 90), 160, 90)
+    forward = np.array([np.sin(yaw), np.cos(yaw), 0.0])
+    return View(_look_at(eye, eye + forward, np.zeros(3)), intrinsics(160, 90), 160, 90)
 
 
 def box(of: View, low: list[float], high: list[float]) -> np.ndarray:
@@ -78,8 +78,8 @@ def test_masks_are_of_panes_in_which_nothing_moves(world):
     assert (maps["depth_mm"][mirror] == 2980).all() and (maps["depth_mm"][glass] == 6000).all()
     assert (maps["depth_mm"][wall] == 3000).all()
     rays = of.rays().reshape(90, 160, 3) * 3.0 + EYE
-    beside = (rays[..., 0] > -1.75) & (rays[..., 0] < 1.85) & (rays[..., 2] > 0.35) & (rays[..., 2] < 2.65)
-    inner = beside & (maps["depth_mm"] == 3000)
+    in_mirror = (rays[..., 0] > -1.75) & (rays[..., 0] < 1.85) & (rays[..., 2] > 0.35) & (rays[..., 2] < 2.65)
+    inner = in_mirror & (maps["depth_mm"] == 3000)
     assert wall[inner].all() and not wall[(rays[..., 0] < -1.85) | (rays[..., 0] > 1.95)].any()
     assert maps["seen"].all()
 
@@ -87,24 +87,26 @@ def test_masks_are_of_panes_in_which_nothing_moves(world):
 def test_a_mirror_was_seen_where_the_other_view_saw_the_same_in_it(world):
     of = view()
     mirror = region_maps(world, world.at(1), 1, of, of)[THING + "mirror"]
-    away = region_maps(world, world.at(1), 1, of, view(1.2))
-    assert not away["seen"][mirror].any(), "the mirror is not in that frame"
+    turned = region_maps(world, world.at(1), 1, of, view(1.2))
+    assert not turned["seen"][mirror].any(), "the mirror is not in that frame"
     # Seen from half a metre to the left, the left third of the mirror's content lies beyond its edge: the image of the
     # wall at -3 is three times as far as the mirror.
-    beside = region_maps(world, world.at(1), 1, of, view(0.0, EYE - [0.5, 0, 0]))
-    share = beside["seen"][mirror].mean()
+    shifted = region_maps(world, world.at(1), 1, of, view(0.0, EYE - [0.5, 0, 0]))
+    share = shifted["seen"][mirror].mean()
     assert share == pytest.approx(2 / 3, abs=0.07)
     columns = np.flatnonzero(mirror.any(axis=0))
-    seen = (beside["seen"] & mirror).sum(axis=0)[columns] / mirror.sum(axis=0)[columns]
+    seen = (shifted["seen"] & mirror).sum(axis=0)[columns] / mirror.sum(axis=0)[columns]
     assert seen[:3].mean() < 0.1 and seen[-3:].mean() > 0.9
 
 
 def test_what_hides_a_point_from_the_mirror_hides_it_from_the_eye(world):
     """From 0.7 to the side, the mirror shows a part of the rear wall that the board at 0.8 hides from the other eye."""
     near = with_board(world, [0.0, 2.3, 0.0])
-    of, other = view(), view(0.0, EYE - np.array([0.7, 0, 0]))
-    maps = region_maps(near, near.at(1), 1, other, of)
-    shown = (other.rays() * 8.96 + other.eye).reshape(90, 160, 3)  # images of the wall at -3, with the mirror at 2.98
+    of, eye_view = view(), view(0.0, EYE - np.array([0.7, 0, 0]))
+    maps = region_maps(near, near.at(1), 1, eye_view, of)
+    shown = (eye_view.rays() * 8.96 + eye_view.eye).reshape(
+        90, 160, 3
+    )  # images of the wall at -3, with the mirror at 2.98
     x, y = np.moveaxis(of.project(shown)[0], 2, 0)
     board = box(of, [-1.3, 2 * 2.98 - 0.8, 1.6], [-0.9, 2 * 2.98 - 0.8, 2.0])
     inside = (x > 0) & (x < 160) & (y > 0) & (y < 90)

@@ -133,7 +133,7 @@ def test_truth_at_the_pose_of_its_own_instant_is_the_clips_frame(scene):
 
 @pytest.mark.parametrize("pose", [1, 5])
 def test_seen_pixels_are_where_the_frozen_frame_shows_them(scene, pose):
-    regions, own = scene.regions(9, pose), scene.frame_depth(9)
+    regions, frame_depth = scene.regions(9, pose), scene.frame_depth(9)
     points = unproject(scene, pose, regions.depth)
     pixels, depth = project(scene, 9, points)
     column, row = np.floor(pixels).astype(int).T
@@ -141,11 +141,11 @@ def test_seen_pixels_are_where_the_frozen_frame_shows_them(scene, pose):
     seen = regions.seen.ravel()
     assert not seen[~inside].any()
     # Compared with the frame's own depths: the nearest of 3x3 pixels, because a pixel is not a point.
-    padded = np.pad(own, 1, mode="edge")
+    padded = np.pad(frame_depth, 1, mode="edge")
     around = np.stack([padded[1 + row[inside] + i, 1 + column[inside] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    off = np.abs(around - depth[inside]).min(axis=0) / depth[inside]
+    error = np.abs(around - depth[inside]).min(axis=0) / depth[inside]
     hidden = around.min(axis=0) < depth[inside] - 0.01
-    assert (off[seen[inside]] < 0.02).mean() > 0.99
+    assert (error[seen[inside]] < 0.02).mean() > 0.99
     assert hidden[~seen[inside]].mean() > 0.95
     assert 0.2 < seen.mean() < 1.0
 
@@ -331,8 +331,8 @@ def seen_from(folder: Path, kind: str, time: int, pose: int) -> dict[str, np.nda
     """`region_maps` of a hard scene of size `tiny`, enlarged."""
     geometry, views = Geometry.load(folder), views_of(SEED, TINY, kind)
     width, height = FINER * TINY.width, FINER * TINY.height
-    own, other = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
-    return region_maps(geometry, geometry.at(time), time, other, own)
+    frame_view, pose_view = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
+    return region_maps(geometry, geometry.at(time), time, pose_view, frame_view)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in HARD if kind in BEFORE])
@@ -343,18 +343,18 @@ def test_a_hard_scene_is_what_it_was(kind, hard):
 @pytest.mark.parametrize("kind", [kind for kind in HARD if kind != HELD])
 def test_a_hard_scene_has_its_thing_in_view(kind, hard):
     maps = seen_from(hard[kind], kind, 8, 4)
-    things = {name.removeprefix(THING): mask for name, mask in maps.items() if name.startswith(THING)}
-    assert set(things) == ({"glass", "mirror", "wall"} if kind == "glass" else {kind})
-    for mask in things.values():
+    masks = {name.removeprefix(THING): mask for name, mask in maps.items() if name.startswith(THING)}
+    assert set(masks) == ({"glass", "mirror", "wall"} if kind == "glass" else {kind})
+    for mask in masks.values():
         assert 1e-4 < mask.mean() < 0.5
     if kind == "glass":
-        assert not (things["glass"] & things["mirror"]).any() and not (things["wall"] & maps["moving"]).any()
-        assert not ((things["glass"] | things["mirror"]) & maps["moving"]).any()
+        assert not (masks["glass"] & masks["mirror"]).any() and not (masks["wall"] & maps["moving"]).any()
+        assert not ((masks["glass"] | masks["mirror"]) & maps["moving"]).any()
     if kind in ("swinging", "arm"):
-        assert maps["moving"][things[kind]].mean() > 0.7
+        assert maps["moving"][masks[kind]].mean() > 0.7
     if kind == "hair":
         # Most of the hair is seen in front of the window, which shows the sky, or in front of more hair.
-        around = ndimage.binary_dilation(things["hair"], iterations=12)
+        around = ndimage.binary_dilation(masks["hair"], iterations=12)
         assert (maps["depth_mm"][around] == 0).mean() > 0.2
 
 
@@ -411,8 +411,8 @@ def test_a_mirror_shows_the_room_and_a_thing_can_be_taken_away(hard, tmp_path):
     assert np.median(changed[mirror]) > 10 and np.median(changed[glass]) > 2 and np.median(changed[wall]) < 1
     truth, behind = render("arm", "arm")
     geometry, views = Geometry.load(hard["arm"]), views_of(SEED, TINY, "arm")
-    there = region_maps(geometry, geometry.at(8), 8, views[8], views[8])[THING + "arm"]
-    assert (behind[there].sum(axis=1) > 0).all() and (np.abs(truth - behind).mean(axis=2)[there] > 15).mean() > 0.5
+    arm = region_maps(geometry, geometry.at(8), 8, views[8], views[8])[THING + "arm"]
+    assert (behind[arm].sum(axis=1) > 0).all() and (np.abs(truth - behind).mean(axis=2)[arm] > 15).mean() > 0.5
 
 
 def test_an_exact_shot_is_one_that_the_product_trains_on(scene, tmp_path):
@@ -434,8 +434,8 @@ def test_surface_points_lie_on_what_the_frames_see(scene):
     points = surface_points(scene)
     pixels, depth = project(scene, 1, points["xyz"][: len(points["xyz"]) // 6].astype(np.float64))
     column, row = np.clip(np.floor(pixels).astype(int), 0, [scene.width - 1, scene.height - 1]).T
-    off = np.abs(scene.frame_depth(1)[row, column] - depth) / depth
-    assert np.median(off) < 0.01
+    relative_error = np.abs(scene.frame_depth(1)[row, column] - depth) / depth
+    assert np.median(relative_error) < 0.01
 
 
 def test_the_similarity_leads_from_solved_cameras_to_exact_ones(scene, tmp_path):

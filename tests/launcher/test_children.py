@@ -262,15 +262,15 @@ environments.set_up(environments.Environment("x", pathlib.Path(sys.argv[2]), ("s
 """
 
 
-def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent, made):
+def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent, make_environment):
     """pip waits for an index that does not answer; the index measures when pip hangs up."""
     (requirements / "small.lock").write_text(f"there-is-no-such-package==1.0 --hash=sha256:{'0' * 64}\n")
-    made(tmp_path / "home" / ".venv")
+    make_environment(tmp_path / "home" / ".venv")
     with socket.create_server(("127.0.0.1", 0)) as index:
         index.settimeout(120)
         address = f"http://127.0.0.1:{index.getsockname()[1]}/simple"
-        asked = {"PIP_INDEX_URL": address, "PIP_TIMEOUT": "600", "PIP_NO_INDEX": "0", "NO_PROXY": "*"}
-        launcher = parent(SETTING_UP, requirements, tmp_path / "home" / ".venv", **asked)
+        pip_settings = {"PIP_INDEX_URL": address, "PIP_TIMEOUT": "600", "PIP_NO_INDEX": "0", "NO_PROXY": "*"}
+        launcher = parent(SETTING_UP, requirements, tmp_path / "home" / ".venv", **pip_settings)
         pip, _ = index.accept()
         with pip:
             pip.settimeout(60)

@@ -162,22 +162,25 @@ def test_clips_and_shots_of_one_name_have_folders_of_their_own_and_find_them_aga
     for shot in shots:
         shot.mkdir(parents=True)
 
-    def froze(given: Path) -> str:
-        place = main._place_of(str(given), [], tmp_path / "output")
-        made = tmp_path / "output" / place
-        (made / "shot.splannequin").mkdir(parents=True, exist_ok=True)
-        if given in clips:
-            write_json(made / "shot.splannequin" / "shot.json", {"version": 1, "source": str(given)})
+    def froze(source: Path) -> str:
+        place = main._place_of(str(source), [], tmp_path / "output")
+        output_folder = tmp_path / "output" / place
+        (output_folder / "shot.splannequin").mkdir(parents=True, exist_ok=True)
+        if source in clips:
+            write_json(output_folder / "shot.splannequin" / "shot.json", {"version": 1, "source": str(source)})
         else:
-            (made / "shot.splannequin").rmdir()
-        write_json(made / "summary.json", {"shot": str(made / "shot.splannequin" if given in clips else given)})
+            (output_folder / "shot.splannequin").rmdir()
+        write_json(
+            output_folder / "summary.json",
+            {"shot": str(output_folder / "shot.splannequin" if source in clips else source)},
+        )
         return place
 
     walk = tmp_path / "in" / "walk_freeze.mp4"
     clips.append(walk)
-    first = {given: froze(given) for given in (*shots, *clips)}
+    first = {source: froze(source) for source in (*shots, *clips)}
     assert len(set(first.values())) == len(first) and first[shots[0]] == "walk_freeze" and first[clips[0]] == "a"
-    assert {given: froze(given) for given in (*clips, *shots)} == first
+    assert {source: froze(source) for source in (*clips, *shots)} == first
 
 
 def test_what_only_a_clip_wants_is_refused_of_a_shot(tmp_path: Path):

@@ -53,13 +53,15 @@ print("ends", mine.name, other.exists(), flush=True)
 def test_two_legs_run_beside_each_other_and_each_ones_output_stays_whole(tmp_path: Path, capfd):
     pair = [tmp_path / "one", tmp_path / "two"]
     legs = [Leg(a.name, [sys.executable, "-c", MEETING, str(a), str(b)]) for a, b in (pair, pair[::-1])]
-    alone = Leg("Three", [sys.executable, "-c", "import os; raise SystemExit(os.environ['OMP_NUM_THREADS'] == '')"])
-    run_legs([*legs, alone], sys.executable, tmp_path, at_once=2)
+    single_leg = Leg(
+        "Three", [sys.executable, "-c", "import os; raise SystemExit(os.environ['OMP_NUM_THREADS'] == '')"]
+    )
+    run_legs([*legs, single_leg], sys.executable, tmp_path, at_once=2)
     out = capfd.readouterr().out
     for name in ("one", "two"):
         assert f"begins {name}\nends {name} True\n\n=== {name}: 1 passed, 0 failed" in out
         assert (tmp_path / f"{name}.log").read_text() == f"begins {name}\nends {name} True\n"
-    assert [leg.passed for leg in (*legs, alone)] == [1, 1, 1]
+    assert [leg.passed for leg in (*legs, single_leg)] == [1, 1, 1]
 
 
 def test_one_leg_at_a_time_prints_as_it_goes(tmp_path: Path, capfd):

@@ -12,9 +12,9 @@ from torch_backend.contract import (
 from torch_backend.contract.clip_shot import refuse_anothers
 
 
-def imported(folder, source, beside=None):
+def imported(folder, source, relative_path=None):
     write_json(folder / "shot.json", {"version": 1, "name": "a", "source": str(source)})
-    write_json(folder / "frames" / "frames.json", {} if beside is None else {"beside": beside})
+    write_json(folder / "frames" / "frames.json", {} if relative_path is None else {"beside": relative_path})
 
 
 def test_clips_of_one_stem_have_shots_of_their_own_whatever_was_imported_before(tmp_path):

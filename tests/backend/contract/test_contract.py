@@ -148,9 +148,9 @@ def test_ps_tells_the_same_as_proc():
     before = time.time()
     child = child_process()
     try:
-        told, known = contract.process_of_ps(child.pid), contract.process(child.pid)
-        assert told is not None and known is not None and told.command == known.command
-        assert before - 5.0 < told.started < time.time() + 5.0
+        by_ps, by_proc = contract.process_of_ps(child.pid), contract.process(child.pid)
+        assert by_ps is not None and by_proc is not None and by_ps.command == by_proc.command
+        assert before - 5.0 < by_ps.started < time.time() + 5.0
     finally:
         child.kill()
         child.communicate()

@@ -40,8 +40,8 @@ def test_kernels_compile_for_gpus_that_are_not_here(tmp_path, arch):
     wp = initialised_warp()
     module = planes_cuda.kernels(16).samples.module
     wp.compile_aot_module(module, arch=arch, module_dir=str(tmp_path), use_ptx=True)
-    (made,) = tmp_path.rglob("*.ptx")
-    text = made.read_text(errors="replace")
+    (ptx,) = tmp_path.rglob("*.ptx")
+    text = ptx.read_text(errors="replace")
     # A thread reads four channels at once, adds with atomics, and keeps its data in registers.
     assert len(re.findall(r"ld\.(global\.)?v4", text)) == 24 and text.count("atom.global.add.f32") == 24
     assert "ld.local" not in text

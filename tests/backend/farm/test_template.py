@@ -18,21 +18,21 @@ from torch_backend.farm.work import steps_of
 @pytest.fixture
 def shots(shot):
     """Two shots; the name of one contains the syntax of a template reference."""
-    hall, other = shot("hall").root, shot("kitchen", last=23)
-    write_json(other.info_path, {"version": 1, "name": "kit {{chen}}"})
-    return [str(hall), str(other.root)]
+    hall, kitchen = shot("hall").root, shot("kitchen", last=23)
+    write_json(kitchen.info_path, {"version": 1, "name": "kit {{chen}}"})
+    return [str(hall), str(kitchen.root)]
 
 
 @pytest.fixture
 def job(tmp_path, shots, capsys):
     """job(*words): (template, parameters, folder) of `farm export` of both shots with these options."""
 
-    def made(*words):
+    def make(*words):
         folder = tmp_path / "job"
         assert cli.main(["farm", "export", *shots, "--output", str(folder), *words]) == 0, capsys.readouterr().err
         return *(json.loads((folder / name).read_text()) for name in ("template.json", "parameters.json")), folder
 
-    return made
+    return make
 
 
 def named(template, name):
@@ -170,19 +170,19 @@ def test_whatever_shots_are_called_the_engine_takes_the_job(tmp_path, imported, 
     template = json.loads((tmp_path / "job" / "template.json").read_text())
     values = json.loads((tmp_path / "job" / "parameters.json").read_text())
     read = model.decode_job_template(template=template)
-    given = model.preprocess_job_parameters(
+    preprocessed = model.preprocess_job_parameters(
         job_template=read, job_parameter_values=values, job_template_dir=tmp_path / "job",
         current_working_dir=tmp_path, allow_job_template_dir_walk_up=True,
     )  # fmt: skip
-    job = model.create_job(job_template=read, job_parameter_values=given)
+    job = model.create_job(job_template=read, job_parameter_values=preprocessed)
     assert len({step.name for step in job.steps}) == len(job.steps) == len(ODD) * 7
 
 
 def test_what_a_task_is_told_is_what_was_asked_for_whatever_it_holds(shot, requests):
     model = pytest.importorskip("openjd.model")
     odd = "a}}}b{{{c}}{{d\x7f\udcff\n\\u007d"
-    asked = requests(t_star_per_frame={odd: 1.0})
-    (one,) = gather([str(shot("hall").root)], asked, [], {}, "")
+    expected = requests(t_star_per_frame={odd: 1.0})
+    (one,) = gather([str(shot("hall").root)], expected, [], {}, "")
     steps = steps_of(one, 10, False)
     template = job_template("odd", steps, {step.kind: Needs(512, False) for step in steps}, False)
     model.decode_job_template(template=template)

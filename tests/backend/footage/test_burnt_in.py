@@ -71,9 +71,11 @@ def test_an_import_says_so_writes_the_mask_and_takes_it_away_with_the_clip(tmp_p
     shot, report = Shot.create(tmp_path / "a.splannequin"), recorder()
     import_footage(shot, str(tmp_path / "marked.mp4"), FootageConfig(step=1), report)
     (said,) = report.warnings
-    told, file = load_frames(shot)["burnt_in"], shot.burnt_in
-    assert said.startswith(f"{100 * told['share']:.1f} % of the picture stands still while the world goes by: a logo,")
-    assert told["share"] == pytest.approx(float((read_png(file)[..., 0] > 0).mean()), abs=1e-5)
+    record, file = load_frames(shot)["burnt_in"], shot.burnt_in
+    assert said.startswith(
+        f"{100 * record['share']:.1f} % of the picture stands still while the world goes by: a logo,"
+    )
+    assert record["share"] == pytest.approx(float((read_png(file)[..., 0] > 0).mean()), abs=1e-5)
     (mask,) = read_masks(shot, {"ignore": str(file), "people": ""}, recorder()).values()
     assert (mask.of(5) & inside).sum() > 0.97 * inside.sum(), "the solve takes it as it is"
     report = recorder()

@@ -297,9 +297,9 @@ def test_the_listing_says_how_the_footage_was_read(shot, clip, sequence, recorde
 
 
 def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, sequence, recorder):
-    told = import_footage(shot, clip, FootageConfig(), recorder())["read_as"]
+    reading = import_footage(shot, clip, FootageConfig(), recorder())["read_as"]
     assert (
-        told
+        reading
         == load_frames(shot)["read_as"]
         == [
             "Read as 64 x 48, square pixels, 10 fps, 8 bits, video, Rec.709, matrix BT.601, video levels, no alpha.",
@@ -313,8 +313,8 @@ def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, 
         "Assumed, for the footage does not say: colour space.",
     ]
     report = recorder()
-    told = import_footage(shot, str(sequence(1)), chosen, report)["read_as"]
-    assert told == [
+    reading = import_footage(shot, str(sequence(1)), chosen, report)["read_as"]
+    assert reading == [
         "Read as 128 x 48, pixels 2 times as wide, 24 fps, 8 bits, sRGB, Rec.709, no alpha.",
         "Frames 1 to 12 are read from shot.####.png.",
         "Assumed, for the footage does not say: rate.",
@@ -344,30 +344,30 @@ def test_frames_json_is_plain(shot, clip, recorder):
 
 def test_an_import_is_known_by_what_version_0_2_noted_of_it(shot, clip, recorder):
     info = open_source(clip).info
-    asked = {"first": 2, "last": 19, "step": 2, "working_height": 96, "fps": 0.0}
-    config = FootageConfig(source=clip, **asked)
-    assert import_key(info, config) == content_key(1, info.key, asked)
-    named = FootageConfig(source=clip, layer="left", **asked)
-    assert import_key(info, named) == content_key(1, info.key, {**asked, "layer": "left"})
+    settings = {"first": 2, "last": 19, "step": 2, "working_height": 96, "fps": 0.0}
+    config = FootageConfig(source=clip, **settings)
+    assert import_key(info, config) == content_key(1, info.key, settings)
+    named = FootageConfig(source=clip, layer="left", **settings)
+    assert import_key(info, named) == content_key(1, info.key, {**settings, "layer": "left"})
     import_footage(shot, clip, config, recorder())
     noted = json.loads(shot.listing.read_text())
-    assert noted["config"].items() >= {**asked, "layer": ""}.items() and noted["key"] == import_key(info, config)
+    assert noted["config"].items() >= {**settings, "layer": ""}.items() and noted["key"] == import_key(info, config)
 
 
 @pytest.mark.parametrize("kind", ["video", "sequence"])
 def test_a_copy_of_the_footage_is_the_same_footage(shot, clip, pan, tmp_path, recorder, kind):
     """A copy as made by `cp -r`, with another folder, name and times, keeps the solve."""
-    there = tmp_path / "copied"
-    there.mkdir()
+    copied = tmp_path / "copied"
+    copied.mkdir()
     if kind == "video":
-        first, copy = clip, shutil.copyfile(clip, there / "other.mp4")
+        first, copy = clip, shutil.copyfile(clip, copied / "other.mp4")
     else:
         (tmp_path / "plates").mkdir()
         for n, pixels in enumerate(pan(12), 1):
             write_png(tmp_path / "plates" / f"p.{n:04d}.png", pixels)
-            shutil.copyfile(tmp_path / "plates" / f"p.{n:04d}.png", there / f"q.{n:04d}.png")
-        first, copy = str(tmp_path / "plates" / "p.0001.png"), there / "q.0001.png"
-    for file in there.iterdir():
+            shutil.copyfile(tmp_path / "plates" / f"p.{n:04d}.png", copied / f"q.{n:04d}.png")
+        first, copy = str(tmp_path / "plates" / "p.0001.png"), copied / "q.0001.png"
+    for file in copied.iterdir():
         os.utime(file, (1, 1))
     import_footage(shot, first, FootageConfig(), recorder())
     shot.solve.mkdir()

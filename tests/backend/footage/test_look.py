@@ -66,8 +66,8 @@ def test_another_content_of_the_look_is_another_import(tmp_path, pan, write_vide
     write_video(tmp_path / "a.mp4", pan(8))
     keys = []
     for write in (write_1d, write_3d):
-        told = told_in(FootageConfig(lut=str(write(tmp_path / "look.cube"))))
-        keys.append(open_source(str(tmp_path / "a.mp4"), told=told).info.key)
+        interpretation = told_in(FootageConfig(lut=str(write(tmp_path / "look.cube"))))
+        keys.append(open_source(str(tmp_path / "a.mp4"), told=interpretation).info.key)
     assert keys[0] != keys[1]
 
 

@@ -26,9 +26,9 @@ def shot(tmp_path, pan, recorder):
     (tmp_path / "clip").mkdir()
     for number, pixels in zip(FRAMES, pan(10), strict=True):
         write_png(tmp_path / "clip" / f"f.{number}.png", pixels)
-    made = Shot.create(tmp_path / "a.splannequin")
-    import_footage(made, str(tmp_path / "clip"), FootageConfig(), recorder())
-    return made
+    new_shot = Shot.create(tmp_path / "a.splannequin")
+    import_footage(new_shot, str(tmp_path / "clip"), FootageConfig(), recorder())
+    return new_shot
 
 
 def white(covered):
@@ -166,8 +166,8 @@ def test_a_video_without_alpha_is_told_to_have_none(tmp_path, pan, recorder, wri
 def test_a_mask_is_known_by_what_it_covers_and_not_by_its_file(shot, recorder, tmp_path):
     first = masks_of(shot, recorder, people=write_masks(tmp_path / "m", FRAMES))["people"]
     again = masks_of(shot, recorder, people=write_masks(tmp_path / "n", FRAMES))["people"]
-    other = masks_of(shot, recorder, people=write_masks(tmp_path / "o", FRAMES, np.roll(COVERED, 1, 0)))["people"]
-    assert first.key == again.key != other.key
+    second = masks_of(shot, recorder, people=write_masks(tmp_path / "o", FRAMES, np.roll(COVERED, 1, 0)))["people"]
+    assert first.key == again.key != second.key
 
 
 @pytest.mark.parametrize(

@@ -46,9 +46,9 @@ def test_the_shot_counts_from_its_start_and_every_frame_is_read_again_as_its_own
     tmp_path, footage, pictures, recorder, skipped
 ):
     """Plates have full height although working frames have a quarter: plates are read from the footage."""
-    source, own = footage
+    source, file_numbers = footage
     shot = Shot.create(tmp_path / "a.splannequin")
-    config = FootageConfig(start=1001, first=own + skipped if skipped else None, working_height=24)
+    config = FootageConfig(start=1001, first=file_numbers + skipped if skipped else None, working_height=24)
     import_footage(shot, str(source), config, recorder())
     numbers = [row["frame"] for row in load_frames(shot)["frames"]]
     assert numbers == list(range(1001, 1001 + COUNT - skipped))
@@ -63,16 +63,16 @@ def test_the_shot_counts_from_its_start_and_every_frame_is_read_again_as_its_own
 
 @pytest.mark.parametrize("footage", COUNTED, indirect=True)
 def test_an_import_without_a_start_stays_finished_also_where_the_start_is_the_footages_own(tmp_path, footage, recorder):
-    source, own = footage
+    source, file_numbers = footage
     shot = Shot.create(tmp_path / "a.splannequin")
     import_footage(shot, str(source), FootageConfig(), recorder())
     before = json.loads(shot.listing.read_text())
     assert "shift" not in before
     shot.solve.mkdir()
-    for start in (None, own):
+    for start in (None, file_numbers):
         import_footage(shot, str(source), FootageConfig(start=start), recorder())
         assert shot.solve.is_dir() and json.loads(shot.listing.read_text()) == before
-    import_footage(shot, str(source), FootageConfig(start=own + 1), recorder())
+    import_footage(shot, str(source), FootageConfig(start=file_numbers + 1), recorder())
     assert not shot.solve.exists()
 
 

@@ -129,10 +129,12 @@ def test_pictures_are_shown_by_their_exif_orientation(tmp_path, pan, code, suffi
     assert bool(source.info.unlike) == (code != 1)
 
 
-@pytest.mark.parametrize(("other", "words"), [(3, "turned by 180 degrees"), (6, "turned clockwise"), (2, "mirrored")])
-def test_pictures_that_differ_in_orientation_are_refused(tmp_path, pan, other, words):
+@pytest.mark.parametrize(
+    ("second_orientation", "words"), [(3, "turned by 180 degrees"), (6, "turned clockwise"), (2, "mirrored")]
+)
+def test_pictures_that_differ_in_orientation_are_refused(tmp_path, pan, second_orientation, words):
     """The headers cannot tell whether the pixels or the orientation tags of such a sequence are consistent."""
-    write_pictures(tmp_path / "a", pan(4), [1, 1, other, other])
+    write_pictures(tmp_path / "a", pan(4), [1, 1, second_orientation, second_orientation])
     with pytest.raises(JobError) as caught:
         list(open_source(str(tmp_path / "a")).frames(None, None))
     assert "f_0003.png" in caught.value.message and words in caught.value.message

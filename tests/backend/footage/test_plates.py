@@ -20,7 +20,7 @@ from torch_backend.lens.undistort import Undistorter, of_frames
 from torch_backend.shot import Shot, write_json
 
 
-def solved(shot, radial=0.0, **told):
+def solved(shot, radial=0.0, **facts):
     """Write a solve with one radial lens for `shot`, and undistort its frames as the solve does."""
     record = load_frames(shot)
     width, height = record["width"], record["height"]
@@ -30,8 +30,8 @@ def solved(shot, radial=0.0, **told):
     shot.solve.mkdir(exist_ok=True)
     write_json(shot.solve / "cameras.json", CameraPath(width, height, cameras).to_json())
     record_of_solve = {"version": 1, "key": f"k{radial}", "camera_model": "SIMPLE_RADIAL", "distortion": [radial]}
-    write_json(shot.solve / "solve.json", {**record_of_solve, "focal_px": float(width), **told})
-    if "camera_model" not in told:
+    write_json(shot.solve / "solve.json", {**record_of_solve, "focal_px": float(width), **facts})
+    if "camera_model" not in facts:
         where = load_plate_lenses(shot)[cameras[0].frame].where(width, height)
         undistort = of_frames(Undistorter(where), where, display_of(record))
         for row in record["frames"]:
@@ -184,8 +184,8 @@ def at_random(numbers):
 
 
 def as_frozen(numbers):
-    asked = (m for n in numbers for m in (n, n - 2, n + 2, n - 4, n + 4, numbers[len(numbers) // 2]))
-    return [m for m in asked if m in numbers]
+    requested = (m for n in numbers for m in (n, n - 2, n + 2, n - 4, n + 4, numbers[len(numbers) // 2]))
+    return [m for m in requested if m in numbers]
 
 
 VIDEOS = {
@@ -270,15 +270,15 @@ def test_an_import_whose_chroma_was_scaled_up_otherwise_is_known_again(tmp_path,
     clip = tmp_path / "a.mp4"
     write_video(clip, [np.ascontiguousarray(wide[:, 3 * n : 3 * n + 96]) for n in range(9)])
     shot = shot_of(clip, working_height=32)
-    off = 0.0
+    largest = 0.0
     for file in sorted(shot.raw.iterdir()):
         picture = read_png(file).astype(np.float32)
         luma = (picture @ np.array([0.2126, 0.7152, 0.0722], np.float32))[..., None]
         chroma = picture - luma
-        other = np.clip(np.rint(luma + 0.5 * (chroma + np.roll(chroma, 1, axis=1))), 0, 255).astype(np.uint8)
-        off = max(off, float(np.abs(other - picture).max()))
-        write_png(file, other)
-    assert off > 12.0, "else nothing differs"
+        blended = np.clip(np.rint(luma + 0.5 * (chroma + np.roll(chroma, 1, axis=1))), 0, 255).astype(np.uint8)
+        largest = max(largest, float(np.abs(blended - picture).max()))
+        write_png(file, blended)
+    assert largest > 12.0, "else nothing differs"
     write_json(shot.listing, {**read_json(shot.listing), "key": "of an earlier version"})
     assert Plates(shot).note == ""
     files = sorted(shot.raw.iterdir())

@@ -62,10 +62,10 @@ def test_rec709_light_needs_no_words_and_what_was_assumed_is_recorded(tmp_path):
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", flat(0.3, 0.2, 0.1))
         write(tmp_path / f"b.{i}.exr", flat(0.3, 0.2, 0.1), chromaticities=values)
-    for name, told in (("a.0.exr", False), ("b.0.exr", True)):
+    for name, is_named in (("a.0.exr", False), ("b.0.exr", True)):
         source, pixel = first_of(tmp_path / name)
         assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=5e-5)
-        assert (said(source), source.info.reading["colour_told"]) == ([], told)
+        assert (said(source), source.info.reading["colour_told"]) == ([], is_named)
 
 
 def test_impossible_chromaticities_are_told(tmp_path):
@@ -107,8 +107,8 @@ def test_a_colour_profile_that_is_not_applied_is_told(tmp_path, name, words):
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{content.size}]"), content)
         out = oiio.ImageOutput.create(str(tmp_path / f"a.{i}.png"))
         assert out.open(str(tmp_path / f"a.{i}.png"), spec) and out.write_image(pixels) and out.close()
-    told = [f"The pictures carry the colour profile {name!r}, which is not applied."]
-    assert said(first_of(tmp_path)[0]) == (told if words else [])
+    warnings = [f"The pictures carry the colour profile {name!r}, which is not applied."]
+    assert said(first_of(tmp_path)[0]) == (warnings if words else [])
 
 
 def write_cineon(path, codes):

@@ -135,8 +135,8 @@ def test_a_clip_that_is_interlaced_without_saying_so_becomes_whole_pictures(tmp_
         "The clip is interlaced, though it does not say so: each frame becomes a whole picture of its first field."
     ]
     assert source.info.reading["interlaced"] and source.info.unlike.startswith("it is interlaced")
-    off = [np.abs(one.pixels.astype(int) - first)[4:-4].mean() for one, first in zip(got, frames[::2], strict=True)]
-    assert max(off) < 1.0, max(off)
+    errors = [np.abs(one.pixels.astype(int) - first)[4:-4].mean() for one, first in zip(got, frames[::2], strict=True)]
+    assert max(errors) < 1.0, max(errors)
     reader = source.plates(Known({f.number: f.seconds for f in got}, 0.0, lambda number, plate: True))
     assert (reader.plate(9) == got[8].pixels).all()
     reader.close()
@@ -198,8 +198,8 @@ def test_damaged_packets_are_skipped_with_a_warning_and_keep_their_numbers(tmp_p
 
 
 @pytest.fixture
-def broken_off(tmp_path, pan, write_video):
-    """broken_off(suffix, share): the first part of a clip of 24 frames whose header is at the beginning of the file."""
+def truncated_clip(tmp_path, pan, write_video):
+    """truncated_clip(suffix, share): first part of a clip of 24 frames with the header at the beginning of the file."""
 
     def make(suffix, share):
         whole = tmp_path / f"whole.{suffix}"
@@ -214,19 +214,19 @@ def broken_off(tmp_path, pan, write_video):
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
-def test_a_file_that_breaks_off_says_how_much_of_it_there_is(broken_off, suffix):
-    source, got = decoded(broken_off(suffix, 0.75))
+def test_a_file_that_breaks_off_says_how_much_of_it_there_is(truncated_clip, suffix):
+    source, got = decoded(truncated_clip(suffix, 0.75))
     assert 12 <= len(got) < 24
     assert [f.number for f in got] == list(range(1, len(got) + 1))
     assert [w[0] for w in source.warnings] == [f"broken.{suffix} breaks off after frame {len(got)}: it announces 24."]
-    asked, got = decoded(broken_off(suffix, 0.75), 2, 10)  # the range ends before the break: no warning
-    assert ([f.number for f in got], asked.warnings) == (list(range(2, 11)), [])
+    opened, got = decoded(truncated_clip(suffix, 0.75), 2, 10)  # the range ends before the break: no warning
+    assert ([f.number for f in got], opened.warnings) == (list(range(2, 11)), [])
 
 
 @pytest.mark.parametrize(("suffix", "share"), [("mp4", 0.6), ("mov", 0.45), ("mkv", 0.45)])
-def test_less_than_half_of_a_file_is_refused(broken_off, suffix, share):
+def test_less_than_half_of_a_file_is_refused(truncated_clip, suffix, share):
     with pytest.raises(JobError, match=r"breaks off after frame \d+: it announces 24\.") as error:
-        decoded(broken_off(suffix, share))
+        decoded(truncated_clip(suffix, share))
     assert error.value.exit_code == ExitCode.FOOTAGE
 
 
@@ -315,13 +315,13 @@ def test_a_recording_that_was_not_finished_is_told_so(tmp_path, pan, write_video
     data = (tmp_path / "a.mp4").read_bytes()
     at = data.index(b"moov") - 4
     mdat = data.index(b"mdat") - 4
-    made = {
+    cases = {
         "index missing": data[:at],
         "copy broken off": data[: at - 100],
         "never closed": data[:mdat] + bytes(4) + data[mdat + 4 : at - 7],
         "zeros behind": data[:at] + bytes(4096),
     }[how]
-    (tmp_path / "a.mov").write_bytes(made)
+    (tmp_path / "a.mov").write_bytes(cases)
     with pytest.raises(JobError, match=r"a.mov was not finished: its index \(the moov atom\) is missing") as caught:
         open_source(str(tmp_path / "a.mov"))
     assert caught.value.exit_code == ExitCode.FOOTAGE
@@ -353,10 +353,10 @@ def test_which_of_two_streams_is_read_is_said_and_the_other_can_be_named(two_str
         )
     ]
     assert close(got[0].pixels, firsts[0], 2) and not source.info.unlike
-    other = open_source(str(path), layer="2")
-    assert close(next(other.frames(None, None)).pixels, firsts[1], 2) and not other.warnings
-    reader = other.plates(Known({n: (n - 1) / 24 for n in range(1, 9)}, 0.0, lambda *_: True))
-    assert close(reader.plate(1), firsts[1], 2) and "several video streams" in other.info.unlike
+    second_stream = open_source(str(path), layer="2")
+    assert close(next(second_stream.frames(None, None)).pixels, firsts[1], 2) and not second_stream.warnings
+    reader = second_stream.plates(Known({n: (n - 1) / 24 for n in range(1, 9)}, 0.0, lambda *_: True))
+    assert close(reader.plate(1), firsts[1], 2) and "several video streams" in second_stream.info.unlike
     reader.close()
     with pytest.raises(JobError, match="a.mov has no video stream '3'"):
         open_source(str(path), layer="3")

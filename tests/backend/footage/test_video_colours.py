@@ -145,7 +145,7 @@ def test_a_transfer_function_that_is_not_known_is_told(write_patches):
 
 
 @pytest.mark.parametrize(
-    "size, tags, told, unlike",
+    "size, tags, choices, reason",
     [
         ((48, 64), {}, {}, ""),
         ((16, 1280), {}, {}, "it does not say by which matrix its colours are stored"),
@@ -155,11 +155,11 @@ def test_a_transfer_function_that_is_not_known_is_told(write_patches):
         ((48, 64), {"aspect": Fraction(2)}, {}, "its pixels are not square"),
     ],
 )
-def test_what_other_programs_would_show_otherwise_is_known(tmp_path, write_video, size, tags, told, unlike):
+def test_what_other_programs_would_show_otherwise_is_known(tmp_path, write_video, size, tags, choices, reason):
     """FFmpeg, and therefore Blender, decodes clips without a matrix as BT.601 at any size."""
-    made = {name: tags[name] for name in ("rotation", "aspect") if name in tags}
+    options = {name: tags[name] for name in ("rotation", "aspect") if name in tags}
     frames = [np.full((*size, 3), 60, np.uint8)] * 3
     write_video(
-        tmp_path / "a.mp4", frames, **made, **({"x264-params": "colormatrix=bt709"} if "colorspace" in tags else {})
+        tmp_path / "a.mp4", frames, **options, **({"x264-params": "colormatrix=bt709"} if "colorspace" in tags else {})
     )
-    assert open_source(str(tmp_path / "a.mp4"), told=Told(**told)).info.unlike == unlike
+    assert open_source(str(tmp_path / "a.mp4"), told=Told(**choices)).info.unlike == reason

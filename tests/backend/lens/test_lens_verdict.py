@@ -55,12 +55,12 @@ def test_a_focal_length_that_was_given_is_not_doubted_unless_the_solve_ran_off_f
 
 
 def answer(focal=600.0, **lens):
-    told = {"doubt": "", "held": False, "found_px": focal, "width": 640, "height": 480, **lens}
-    return {"focal_px": focal, "distortion": [4.08], "lens": told}
+    lens_facts = {"doubt": "", "held": False, "found_px": focal, "width": 640, "height": 480, **lens}
+    return {"focal_px": focal, "distortion": [4.08], "lens": lens_facts}
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("solve", "words"),
     [
         (answer(5000.0), "7.3 degrees wide (5000 px)"),
         (answer(80.0), "151.9 degrees wide (80 px)"),
@@ -69,30 +69,30 @@ def answer(focal=600.0, **lens):
         (answer(impossible="strong"), "it bends the picture out of all measure (4.08)"),
     ],
 )
-def test_a_lens_that_no_camera_has_is_refused_in_one_sentence(told, words):
+def test_a_lens_that_no_camera_has_is_refused_in_one_sentence(solve, words):
     with pytest.raises(JobError) as error:
-        refuse_lens(told)
+        refuse_lens(solve)
     assert error.value.message == f"The solve found a lens that no camera has: {words}."
     assert error.value.hint and error.value.exit_code == ExitCode.SOLVE
 
 
 def test_lenses_that_cameras_have_pass_and_so_does_one_that_was_given():
-    for told in (answer(), answer(80.0, view_deg=140.0), answer(5000.0, given_px=5000.0)):
-        refuse_lens(told)
+    for solve in (answer(), answer(80.0, view_deg=140.0), answer(5000.0, given_px=5000.0)):
+        refuse_lens(solve)
 
 
 def test_a_given_focal_length_that_was_held_or_left_is_said():
-    held = lens_remarks(answer(800.0, held=True, doubt="off", found_px=1200.0, given_px=800.0))
-    assert held[0][0].endswith("(1200 px instead of 800): it was held as given.")
+    kept_focal = lens_remarks(answer(800.0, held=True, doubt="off", found_px=1200.0, given_px=800.0))
+    assert kept_focal[0][0].endswith("(1200 px instead of 800): it was held as given.")
     left = lens_remarks(answer(1200.0, doubt="off", given_px=800.0))
     assert left[0][0] == "The focal length came out as 1200 px, and 800 were given."
 
 
 def solved(folder, tools, pictures, **request):
     """(answer, poses by picture) of COLMAP alone, without undistorted frames and mattes."""
-    told, _ = tools.asked(folder, pictures, **request)
-    names = told["solved"]
-    (folder / "request.json").write_text(json.dumps(told))
+    request_facts, _ = tools.request_for(folder, pictures, **request)
+    names = request_facts["solved"]
+    (folder / "request.json").write_text(json.dumps(request_facts))
     found = run_worker(folder / "request.json", folder / "log.txt", tools.recorder())["result"]
     poses = json.loads((folder / "poses.json").read_text())
     return found, [np.array(poses[name]["pose"]) for name in names if name in poses]

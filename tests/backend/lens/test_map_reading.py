@@ -85,8 +85,8 @@ def test_both_ways_and_overscan_give_the_same_lens(tmp_path):
     assert error_px(over, 0.1) < 2e-3
     # All maps give the same lens and plate: the widest window without missing pixels.
     at = places(WIDTH, HEIGHT)[::9, ::9].reshape(-1, 2)
-    for other in (back, over):
-        np.testing.assert_allclose(other.to_original(at), wide.to_original(at), atol=0.05)
+    for variant in (back, over):
+        np.testing.assert_allclose(variant.to_original(at), wide.to_original(at), atol=0.05)
 
 
 def test_maps_that_this_product_writes_are_read_again(tmp_path):
@@ -137,13 +137,13 @@ def test_what_is_cut_off_or_empty_or_transparent_says_nothing(tmp_path):
     }.items():
         lens, _ = read(path)
         assert error_px(lens, 0.2) < 2e-3, name
-    made = np.concatenate([st, inside.astype(float)], -1)
-    spec = oiio.ImageSpec(*made.shape[1::-1], 3, oiio.FLOAT)
+    rgb = np.concatenate([st, inside.astype(float)], -1)
+    spec = oiio.ImageSpec(*rgb.shape[1::-1], 3, oiio.FLOAT)
     spec.channelnames = ("R", "G", "A")
-    made[..., :2][~inside[..., 0]] = 0.7
+    rgb[..., :2][~inside[..., 0]] = 0.7
     output = oiio.ImageOutput.create(str(tmp_path / "c.exr"))
     assert open_output(output, tmp_path / "c.exr", spec)
-    assert output.write_image(made.astype(np.float32)) and output.close()
+    assert output.write_image(rgb.astype(np.float32)) and output.close()
     assert error_px(read(str(tmp_path / "c.exr"))[0], 0.2) < 2e-3
 
 
@@ -164,9 +164,9 @@ def test_layers(tmp_path):
 
 def test_anamorphic_footage_in_its_own_pixels_or_square_ones(tmp_path):
     st = undistorting(beyond=0.2)
-    told = {"reading": {"pixel_aspect": 2.0}}
-    for made in (st, 0.5 * (st[:, ::2] + st[:, 1::2])):
-        lens, _ = read(written(tmp_path, made), **told)
+    footage = {"reading": {"pixel_aspect": 2.0}}
+    for variant in (st, 0.5 * (st[:, ::2] + st[:, 1::2])):
+        lens, _ = read(written(tmp_path, variant), **footage)
         assert error_px(lens, 0.2) < 0.05 and lens.window[0] == pytest.approx(lens.window[1], abs=0.01)
     with pytest.raises(JobError, match="another shape"):
         read(written(tmp_path, st[:, ::2]))

@@ -33,20 +33,20 @@ def test_harmonics_held_apart_are_those_held_together(tools, body, degree):
     together, expected = scene.gradients(body, sh_degree=degree)
     sh = scene.tensors["sh"]
     scene.tensors.update(sh=sh[:, :1].clone(), sh_rest=sh[:, 1:].clone())
-    apart, grads = scene.gradients(body, sh_degree=degree)
-    assert torch.equal(apart.colors, together.colors)
+    split, grads = scene.gradients(body, sh_degree=degree)
+    assert torch.equal(split.colors, together.colors)
     joined = torch.cat([grads.pop("sh"), grads.pop("sh_rest")], dim=1)
     assert torch.equal(joined, expected.pop("sh"))
     assert all(torch.equal(grad, expected[name]) for name, grad in grads.items())
 
 
-@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_gradients_of_what_no_camera_sees_are_zero_whatever_memory_held(tools, cameras, apart):
+def test_gradients_of_what_no_camera_sees_are_zero_whatever_memory_held(tools, cameras, split):
     scene = tools.cloud(700, 50, 41, degree=2)
     scene.tensors["means"][::3, 2] = -5.0  # behind the camera
     tensors = scene.tensors | {"viewmats": scene.tensors["viewmats"].repeat(cameras, 1, 1)}
-    if apart:
+    if split:
         tensors |= {"sh": tensors["sh"][:, :1].clone(), "sh_rest": tensors["sh"][:, 1:].clone()}
     scene = tools.Scene(tensors, scene.Ks.repeat(cameras, 1, 1), 50, 41, scene.options)
     _, expected = scene.gradients("reference", sh_degree=1)
@@ -107,17 +107,17 @@ def test_workspace_reuse_leaves_no_trace(tools):
 
 def test_interleaved_forward_passes_keep_their_own_state(tools):
     a, b = tools.cloud(150, 40, 30, seed=1), tools.cloud(170, 44, 36, seed=2)
-    alone = {}
+    single = {}
     for scene in (a, b):
         leaves = scene.leaves()
         scene.run("cpu", leaves).colors.square().sum().backward()
-        alone[id(scene)] = leaves
+        single[id(scene)] = leaves
     la, lb = a.leaves(), b.leaves()
     out_a, out_b = a.run("cpu", la), b.run("cpu", lb)
     out_a.colors.square().sum().backward()
     out_b.colors.square().sum().backward()
     for scene, leaves in ((a, la), (b, lb)):
-        assert all(torch.equal(leaf.grad, alone[id(scene)][name].grad) for name, leaf in leaves.items())
+        assert all(torch.equal(leaf.grad, single[id(scene)][name].grad) for name, leaf in leaves.items())
 
 
 def test_no_grad_mode_and_other_float_types(tools):
@@ -134,12 +134,12 @@ def test_no_grad_mode_and_other_float_types(tools):
 
 def test_concurrent_callers_do_not_disturb_each_other(tools):
     scenes = [tools.cloud(400 + 50 * i, 60 + i, 50, seed=i) for i in range(3)]
-    alone = [scene.gradients("cpu") for scene in scenes]
+    single = [scene.gradients("cpu") for scene in scenes]
     with ThreadPoolExecutor(3) as pool:
         together = list(pool.map(lambda i: scenes[i % 3].gradients("cpu"), range(24)))
     for i, (out, grads) in enumerate(together):
-        assert torch.equal(out.colors, alone[i % 3][0].colors)
-        assert all(torch.equal(grad, alone[i % 3][1][name]) for name, grad in grads.items())
+        assert torch.equal(out.colors, single[i % 3][0].colors)
+        assert all(torch.equal(grad, single[i % 3][1][name]) for name, grad in grads.items())
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")

@@ -163,16 +163,16 @@ def test_every_table_has_a_row_of_what_is_delivered(results):
             assert any(row[0].split(" against ")[0] == f"auto (ours), {kind}" for row in table.rows), (title, kind)
     regions = {row[0]: row[1:] for row in tables["By region"].rows}
     for kind, gain in zip(kinds, (1.0, 2.0, 4.0), strict=True):
-        for alone, made in zip(regions["auto (ours)"], regions[f"auto (ours), {kind}"], strict=True):
-            assert float(made) - float(alone) == pytest.approx(gain, abs=0.011)
+        for splats, detailed in zip(regions["auto (ours)"], regions[f"auto (ours), {kind}"], strict=True):
+            assert float(detailed) - float(splats) == pytest.approx(gain, abs=0.011)
     won = [row for row in tables["Who wins"].rows if row[0] == "auto (ours), plate detail against auto (ours)"]
     assert [row[1] for row in won] == ["whole frame", "seen at t*", "never seen at t*", "moving", "static"]
     assert all(row[2] == "frozen frame 80.00" and row[3] == "+4.000" and row[-1] == "win" for row in won)
     cost = {row[0]: row for row in tables["What it cost (synthetic scenes)"].rows}
-    fps, held = (tables["What it cost (synthetic scenes)"].header.index(n) for n in ("frozen frames / s", "moving"))
+    fps, moving = (tables["What it cost (synthetic scenes)"].header.index(n) for n in ("frozen frames / s", "moving"))
     assert cost["auto (ours), plate detail"][fps] == "3.0" and cost["auto (ours)"][fps] == "240.0"
     # A run's own frames at their own times are not frozen frames.
-    assert cost["auto (ours), plate detail"][held] == "–" != cost["auto (ours)"][held]
+    assert cost["auto (ours), plate detail"][moving] == "–" != cost["auto (ours)"][moving]
 
 
 def test_an_ablation_is_held_against_splats_alone(results, tmp_path):

@@ -114,9 +114,9 @@ def record(host: str, supervision: str, counts: list[list[int]], error: float) -
 
 
 def test_the_report_tells_of_glass_and_small_movers(tmp_path):
-    made = record("auto", "support", [[10, 20], [4, 5], [30, 30]], 0.1)
-    again = load_record(save_record(tmp_path, made))
-    assert again == made and json.loads((tmp_path / f"{made.run_id}.json").read_text())["matte"] == made.matte
+    rows = record("auto", "support", [[10, 20], [4, 5], [30, 30]], 0.1)
+    again = load_record(save_record(tmp_path, rows))
+    assert again == rows and json.loads((tmp_path / f"{rows.run_id}.json").read_text())["matte"] == rows.matte
     tables = {table.title: table for table in all_tables([again])}
     ours, delivered = tables["Glass and mirrors"].rows
     assert ours == [
@@ -130,8 +130,8 @@ def test_the_report_tells_of_glass_and_small_movers(tmp_path):
 
 
 def test_other_scenes_have_no_such_tables():
-    made = record("auto", "support", [[1, 1]], 0.1)
-    for row in made.rows:
+    rows = record("auto", "support", [[1, 1]], 0.1)
+    for row in rows.rows:
         row.recalled, row.opened, row.regions = {}, {}, {"whole": row.regions["whole"]}
-    made.matte, made.detailed = {}, {}
-    assert not {"Glass and mirrors", "Small movers, and hair"} & {table.title for table in all_tables([made])}
+    rows.matte, rows.detailed = {}, {}
+    assert not {"Glass and mirrors", "Small movers, and hair"} & {table.title for table in all_tables([rows])}

@@ -323,8 +323,8 @@ def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
     ],
 )
 def test_a_doubtful_lens_is_said(lens, words):
-    told = {"focal_px": 7526.0, "lens": {**lens, "found_px": 24_000.0, "width": 1280, "height": 720}}
-    found = [message for message, _ in lens_remarks(told)]
+    answer = {"focal_px": 7526.0, "lens": {**lens, "found_px": 24_000.0, "width": 1280, "height": 720}}
+    found = [message for message, _ in lens_remarks(answer)]
     assert len(found) == len(words) and all(a.endswith(b) for a, b in zip(found, words, strict=True))
 
 
@@ -429,8 +429,8 @@ def test_the_worker_takes_no_module_from_where_the_request_lies(hostile, tmp_pat
     request |= {"overlap": 1, "features": 128, "neighbours": 1, "threads": 1}
     write_json(scratch / "request.json", request)
     try:
-        told = run_worker(scratch / "request.json", scratch / "log.txt", tools.recorder())
+        result = run_worker(scratch / "request.json", scratch / "log.txt", tools.recorder())
     except JobError as error:
-        told = error.message
-    assert "COLMAP" in str(told) or "failure" in told, "the worker itself answered"
+        result = error.message
+    assert "COLMAP" in str(result) or "failure" in result, "the worker itself answered"
     assert not marker.exists(), marker.read_text()

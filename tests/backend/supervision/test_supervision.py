@@ -105,8 +105,8 @@ def anchor(m, field, bins):
     pairs = drawn(m, rows, config, 0)
     if pairs is None:
         return None
-    here = field(m.params["means"].detach()[pairs.rows], centres[pairs.bins])
-    return support_loss(m, field, pairs, here, centres, 1.0, config)
+    deltas = field(m.params["means"].detach()[pairs.rows], centres[pairs.bins])
+    return support_loss(m, field, pairs, deltas, centres, 1.0, config)
 
 
 def test_drawn_pairs_are_unsupported_and_half_of_them_near_support():
@@ -238,8 +238,8 @@ def test_hidden_is_out_of_the_frame_or_behind_what_is_seen():
     assert not bool(m.hidden[:, 0].any())
 
 
-@pytest.mark.parametrize(("moves_away", "anchored"), [(True, False), (False, True)])
-def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
+@pytest.mark.parametrize(("is_gone", "anchored"), [(True, False), (False, True)])
+def test_gone_and_covered_are_told_apart_by_a_render(is_gone, anchored):
     """A dot on a wall fades: in plain view, or behind a post in front of it. Only the covered dot is a guess."""
     from torch_backend.raster import rasterize
 
@@ -251,7 +251,7 @@ def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
     quats[:, 0] = 1
     logits = torch.full((223,), 5.0)
     logits[221] = -6.0  # the dot has faded
-    logits[222] = -9.0 if moves_away else 5.0
+    logits[222] = -9.0 if is_gone else 5.0
     state = {
         "means": means,
         "quats": quats,

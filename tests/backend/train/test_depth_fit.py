@@ -70,10 +70,10 @@ def test_a_metric_sequence_has_one_line_and_few_points_do_not_take_a_frame_away_
     samples = sequence(KINDS[0], [0.4] * FRAMES, [0.1] * FRAMES, noise=0.1)
     few = np.random.default_rng(2).permutation(400)[:25]
     values, depth = samples[7]
-    alone = fit_sequence({7: (values[few], depth[few])})
+    single = fit_sequence({7: (values[few], depth[few])})
     together = fit_sequence({**samples, 7: (values[few], depth[few])})
-    assert alone is not None and together is not None
-    assert abs(together.frames[7].slope - 0.4) < abs(alone.frames[7].slope - 0.4)
+    assert single is not None and together is not None
+    assert abs(together.frames[7].slope - 0.4) < abs(single.frames[7].slope - 0.4)
 
 
 @pytest.mark.parametrize("seed", range(3))

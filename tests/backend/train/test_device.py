@@ -106,13 +106,13 @@ def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
     path = world.shot.root / "gpu.safetensors"
     save_run(trainer, path)
     for device in ("cpu", "cuda"):
-        other = Trainer(scene, images.to(device), scene.solved, config, quiet(), {}, device)
-        restore_run(other, path)
-        assert torch.equal(other.generator.get_state(), trainer.generator.get_state())
+        resumed = Trainer(scene, images.to(device), scene.solved, config, quiet(), {}, device)
+        restore_run(resumed, path)
+        assert torch.equal(resumed.generator.get_state(), trainer.generator.get_state())
         for _ in range(10):
-            schedule_events(other)
-            loss = other.step()
-            other.iteration += 1
+            schedule_events(resumed)
+            loss = resumed.step()
+            resumed.iteration += 1
         assert loss.device.type == device and bool(torch.isfinite(loss))
 
 

@@ -47,13 +47,13 @@ def test_a_place_that_is_told_exposes_as_the_time_does_to_the_bit():
         exposure.values.copy_(0.1 * torch.randn(exposure.values.shape))
     for time in (-0.1, 0.0, 0.21, 0.3, 0.4321, 0.9, 1.2):
         found = []
-        for told in (False, True):
+        for is_named in (False, True):
             exposure.values.grad = None
             left, right, share = exposure.place(time)
             places = torch.tensor([left, right]), torch.tensor([1.0 - share, share])
-            shown = exposure.apply_at(image, *places) if told else exposure.apply(image, time)
+            shown = exposure.apply_at(image, *places) if is_named else exposure.apply(image, time)
             shown.square().sum().backward()
             found.append((shown.detach(), exposure.values.grad))
         assert all(torch.equal(a, b) for a, b in zip(*found, strict=True)), time
-    off = Exposure(torch.tensor([0.0, 1.0]), ExposureConfig(on=False))
-    assert off.apply_at(image, torch.tensor([0, 1]), torch.tensor([0.5, 0.5])) is image
+    disabled = Exposure(torch.tensor([0.0, 1.0]), ExposureConfig(on=False))
+    assert disabled.apply_at(image, torch.tensor([0, 1]), torch.tensor([0.5, 0.5])) is image

@@ -39,8 +39,8 @@ def finished(world, quiet):
     return copy
 
 
-def same(one, other):
-    a, b = (load_checkpoint(path / "checkpoint.safetensors") for path in (one, other))
+def same(first, second):
+    a, b = (load_checkpoint(path / "checkpoint.safetensors") for path in (first, second))
     assert a[0].keys() == b[0].keys()
     for name, value in a[0].items():
         torch.testing.assert_close(b[0][name], value, rtol=1e-4, atol=1e-5, msg=name)
@@ -117,8 +117,8 @@ def test_a_run_is_extended_again_and_again(world, quiet, finished):
     assert (first["iterations"], second["iterations"]) == (80, 110)
     assert second["gaussians"] == before["gaussians"]
     assert second["moving_gaussians"] == before["moving_gaussians"]
-    told = [(e["from_iteration"], e["steps"], e["heldout_psnr_db_before"]) for e in second["extensions"]]
-    assert told == [(60, 20, before["heldout_psnr_db"]), (80, 30, first["heldout_psnr_db"])]
+    extensions = [(e["from_iteration"], e["steps"], e["heldout_psnr_db_before"]) for e in second["extensions"]]
+    assert extensions == [(60, 20, before["heldout_psnr_db"]), (80, 30, first["heldout_psnr_db"])]
     assert before["train_seconds"] < first["train_seconds"] < second["train_seconds"]
     rows = [row["detail"] for row in second["modelled"] if row["what"] == "extension"]
     assert rows == ["20 steps from step 60 on", "30 steps from step 80 on"]

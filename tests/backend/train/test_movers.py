@@ -101,9 +101,9 @@ def test_when_growth_of_a_long_run_ends_who_is_open_and_paints_no_mover_closes(p
     model, config = trainer.model, trainer.config
     movers = model.gaussians.open.clone()
     assert trainer.policy.facts.hardened is not None and movers.any()
-    beside = (centred_on_movers(trainer, 4) == 0) & (moving_frames(trainer, 0.05) == 0)
-    beside &= model.gaussians.support.any(1) & ~movers
-    strays = torch.nonzero(beside).flatten()[:20]
+    static_rows = (centred_on_movers(trainer, 4) == 0) & (moving_frames(trainer, 0.05) == 0)
+    static_rows &= model.gaussians.support.any(1) & ~movers
+    strays = torch.nonzero(static_rows).flatten()[:20]
     model.gaussians.open[strays] = True
     mean = mean_of(model, strays)
     trainer.config.densify.every = 1000  # no round of growth at this step

@@ -67,8 +67,8 @@ def finite(trainer: Trainer) -> bool:
 def aligned(trainer: Trainer) -> bool:
     g, d = trainer.model.gaussians, trainer.densifier
     sizes = {len(t) for t in (*g.params.values(), g.open, g.support, g.hidden, d.gradient, d.seen)}
-    held = {id(p) for group in trainer.optimizer.param_groups for p in group["params"]}
-    return len(sizes) == 1 and all(id(p) in held for p in g.params.values())
+    optimised = {id(p) for group in trainer.optimizer.param_groups for p in group["params"]}
+    return len(sizes) == 1 and all(id(p) in optimised for p in g.params.values())
 
 
 def gaussian(name, value, row=7):
@@ -271,9 +271,9 @@ def test_who_is_thrown_out_of_its_place_is_dropped_and_nobody_else(begin):
     trainer = begin("hexplane", 30)
     model, memory = trainer.model, trainer.soundness.memory
     assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 0
-    thrown = bound_between(trainer, 7)
-    expected = {name: p.detach()[~thrown].clone() for name, p in model.gaussians.params.items()}
-    gradient = trainer.densifier.gradient[~thrown].clone()
+    outliers = bound_between(trainer, 7)
+    expected = {name: p.detach()[~outliers].clone() for name, p in model.gaussians.params.items()}
+    gradient = trainer.densifier.gradient[~outliers].clone()
     assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 7
     for name, p in model.gaussians.params.items():
         assert torch.equal(p, expected[name]), name
@@ -293,8 +293,8 @@ def test_a_round_of_growth_drops_what_is_thrown_behind_a_gate_alone(begin, metho
     # no other Gaussians are added or dropped
     trainer.densifier.config.budget = trainer.densifier.config.prune_opacity = 0
     count = len(trainer.model.gaussians)
-    thrown = bound_between(trainer, 3)
-    kept = trainer.model.gaussians.params["means"].detach()[~thrown].clone()
+    outliers = bound_between(trainer, 3)
+    kept = trainer.model.gaussians.params["means"].detach()[~outliers].clone()
     schedule_events(trainer)
     assert len(trainer.model.gaussians) == count - 3 * (method == "auto")
     if method == "auto":
@@ -328,16 +328,16 @@ def test_a_resumed_run_drops_who_is_thrown_as_an_unbroken_one_does(begin, tmp_pa
     trainer = begin("hexplane", 30)
     trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
     worst = float(trainer.soundness.memory._worst)
-    thrown = bound_between(trainer, 5)
+    outliers = bound_between(trainer, 5)
     save_run(trainer, tmp_path / "checkpoint.safetensors")
     resumed = begin("hexplane", 0)
     restore_run(resumed, tmp_path / "checkpoint.safetensors")
     memory = resumed.soundness.memory
-    assert drop_thrown(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(thrown.sum())
+    assert drop_thrown(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(outliers.sum())
     assert worst > 0 and "put the field back" in memory.put_back(resumed.model.field, resumed.optimizer)
     assert trainer.soundness.memory.put_back(trainer.model.field, trainer.optimizer)
-    for (name, p), (_, other) in zip(trainer.model.field.named_parameters(), resumed.model.field.named_parameters()):
-        assert torch.equal(p, other), name
+    for (name, p), (_, q) in zip(trainer.model.field.named_parameters(), resumed.model.field.named_parameters()):
+        assert torch.equal(p, q), name
 
 
 def test_a_field_that_joins_sooner_starts_at_the_rates_of_a_third_of_the_run():
@@ -412,25 +412,25 @@ def test_a_step_that_memory_did_not_suffice_for_opens_the_gate_once(begin):
 
 
 def test_a_field_that_memory_did_not_suffice_for_is_made_anew(begin, monkeypatch):
-    module, made = sys.modules[schedule_events.__module__], []
+    module, restarts = sys.modules[schedule_events.__module__], []
 
     def short(*arguments):
-        made.append(arguments)
-        if len(made) == 1:
+        restarts.append(arguments)
+        if len(restarts) == 1:
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return add_field(*arguments)
 
     add_field = module.add_field
     monkeypatch.setattr(module, "add_field", short)
     trainer = begin("control_points", steps=0)
-    while not made:
+    while not restarts:
         try:
             go_on(trainer, 1)
         except torch.OutOfMemoryError:
             assert trainer.model.field is None
     go_on(trainer, 2)
     names = [group.get("name") for group in trainer.optimizer.param_groups]
-    assert trainer.model.field is not None and len(names) == len(set(names)) and len(made) == 2
+    assert trainer.model.field is not None and len(names) == len(set(names)) and len(restarts) == 2
 
 
 def test_too_much_to_repair_ends_in_words(begin):

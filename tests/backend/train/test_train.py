@@ -52,9 +52,9 @@ def test_frames_too_many_for_the_memory_train_the_same_run_from_a_file_that_nobo
     monkeypatch.setattr(torch_backend.scene, "HELD_BYTES", 0)
     scene, folder = load_scene(world.shot), world.shot.run("mapped")
     train_shot(world.shot, short(world, "mapped"), quiet())
-    held, _ = load_checkpoint(world.shot.run("held") / "checkpoint.safetensors")
+    from_file, _ = load_checkpoint(world.shot.run("held") / "checkpoint.safetensors")
     mapped, _ = load_checkpoint(folder / "checkpoint.safetensors")
-    assert all(torch.equal(value, mapped[name]) for name, value in held.items())
+    assert all(torch.equal(value, mapped[name]) for name, value in from_file.items())
     images = load_images(scene, scene.solved, 64, 48, beside=folder)
     assert torch.equal(images, load_images(scene, scene.solved, 64, 48))
     assert {path.name for path in folder.iterdir()} == {path.name for path in world.shot.run("held").iterdir()}
@@ -294,8 +294,10 @@ def test_an_evaluation_that_a_cancel_ended_is_made_when_the_run_goes_on(world, q
     pictures = [name for name in whole if name.startswith("previews")]
     assert len(pictures) == 10
     assert {name: whole[name] for name in pictures} == {n: digest for n, digest in holed.items() if n in pictures}
-    held, gone_on = (load_checkpoint(world.shot.run(name) / "checkpoint.safetensors")[0] for name in ("whole", "holed"))
-    assert all(torch.equal(value, gone_on[name]) for name, value in held.items())
+    from_file, resumed = (
+        load_checkpoint(world.shot.run(name) / "checkpoint.safetensors")[0] for name in ("whole", "holed")
+    )
+    assert all(torch.equal(value, resumed[name]) for name, value in from_file.items())
 
 
 def test_what_a_step_was_measured_at_is_not_measured_again_when_the_run_goes_on(world, quiet):
@@ -494,8 +496,8 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wr
     """The file is complete and of the right version, but a tensor is missing or has another shape."""
     shutil.copytree(world.shot.root, tmp_path / "misfit.splannequin")
     shot = Shot.open(tmp_path / "misfit.splannequin")
-    asked = TrainParams(run="misfit", iterations=30, max_gaussians=300, method="hexplane")
-    train_shot(shot, asked, quiet())
+    params = TrainParams(run="misfit", iterations=30, max_gaussians=300, method="hexplane")
+    train_shot(shot, params, quiet())
     path = shot.run("misfit") / CHECKPOINT_FILE
     tensors, meta = load_checkpoint(path)
     if wrong == "exposure":
@@ -507,12 +509,12 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wr
         load_run(shot, "misfit")
     (shot.run("misfit") / "summary.json").unlink()
     with pytest.raises(JobError, match="does not fit this version"):
-        train_shot(shot, asked, quiet())
+        train_shot(shot, params, quiet())
 
 
 def test_a_card_that_fails_says_nothing_of_the_checkpoint():
     """The message must not ask for a new training if the checkpoint is sound."""
     for error in (torch.OutOfMemoryError("CUDA out of memory."), torch.AcceleratorError("an illegal memory access")):
         assert isinstance(error, MISFITS) and misfit(Path("checkpoint"), error, ExitCode.TRAIN) is error
-    told = misfit(Path("checkpoint"), RuntimeError("size mismatch\nfor a"), ExitCode.TRAIN)
-    assert isinstance(told, JobError) and "(RuntimeError: size mismatch)" in str(told)
+    message = misfit(Path("checkpoint"), RuntimeError("size mismatch\nfor a"), ExitCode.TRAIN)
+    assert isinstance(message, JobError) and "(RuntimeError: size mismatch)" in str(message)

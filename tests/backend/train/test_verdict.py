@@ -81,7 +81,9 @@ def test_what_holds_nowhere_is_poor_and_so_is_what_does_not_show_the_clip():
     verdict = judge(figures(unexplained=lost_at(1, 74, 1, 1)))
     assert verdict.word == "poor" and "frames 1 to 73, middle" in verdict.sentences[0]
     assert "Somebody walks through, or the camera is wrong" in verdict.advice[0]
-    by_mattes = [judge(figures(unexplained=lost_at(1, 74, 1, 1), still_unexplained=off)).advice for off in (0.01, 0.2)]
+    by_mattes = [
+        judge(figures(unexplained=lost_at(1, 74, 1, 1), still_unexplained=share)).advice for share in (0.01, 0.2)
+    ]
     assert "Somebody walks through: take" in by_mattes[0][0] and "solve the camera again" in by_mattes[1][0]
     dim = judge(figures(median_db=18.9, tenth_db=17.6, held_out=False))
     said = "It does not show the clip: 18.9 dB on half of its training frames, 17.6 dB on the worst tenth."
@@ -144,14 +146,14 @@ def walk_through(shot):
 def test_a_run_tells_how_far_things_travel(trained):
     """The small world's patch sways by 0.4 units at depth 3.2, which is more than people who hold still."""
     world, summary = trained
-    there = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
-    true = float((there[0] - there[1])[0]) * 60.0 / 3.2
+    places = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
+    true = float((places[0] - places[1])[0]) * 60.0 / 3.2
     assert summary["travel_px"] == pytest.approx(true, rel=0.35)
     assert (summary["quality"], summary["quality_on"]) == ("Fair", "held-out frames")
     kept = read_json(world.shot.run("main") / "summary.json")
     assert kept["verdict"] == summary["verdict"] and summary["unexplained_share"] < 0.01
-    told = re.search(r"(\d+) of 64 pixels", verdict_lines(kept)[1])
-    assert told and float(told[1]) == pytest.approx(summary["farthest_px"], abs=0.56), "rounded once, and once more"
+    match = re.search(r"(\d+) of 64 pixels", verdict_lines(kept)[1])
+    assert match and float(match[1]) == pytest.approx(summary["farthest_px"], abs=0.56), "rounded once, and once more"
 
 
 @pytest.mark.parametrize("holdout", [8, 0])
@@ -164,8 +166,8 @@ def test_somebody_who_walks_through_is_told(tmp_path, quiet, holdout):
     assert summary["quality"] == "Poor"
     assert summary["worst_tenth_psnr_db"] <= summary["median_psnr_db"]
     assert summary["quality_on"] == ("held-out frames" if holdout else "training frames")
-    (told,) = [e for e in report.events if e[0] == "warning" and e[1].startswith("Poor.")]
-    number = re.search(rf"([\d.]+) dB on half of its {summary['quality_on']}", told[1])
+    (warning,) = [e for e in report.events if e[0] == "warning" and e[1].startswith("Poor.")]
+    number = re.search(rf"([\d.]+) dB on half of its {summary['quality_on']}", warning[1])
     assert number and float(number[1]) == pytest.approx(summary["median_psnr_db"], abs=0.056)
-    assert "walks through" in told[2] and "solve" in told[2]
-    assert "It does not hold in frame" in told[2], "frames and place are told"
+    assert "walks through" in warning[2] and "solve" in warning[2]
+    assert "It does not hold in frame" in warning[2], "frames and place are told"

@@ -96,9 +96,9 @@ def test_drawn_grain_is_what_was_measured():
 
 
 def test_grain_is_of_its_frame_alone_and_has_no_mean():
-    first, again, other = (draw(GRAIN, n, flat(0.5), (WIDTH, HEIGHT)) for n in (7, 7, 8))
+    first, again, next_frame = (draw(GRAIN, n, flat(0.5), (WIDTH, HEIGHT)) for n in (7, 7, 8))
     np.testing.assert_array_equal(first, again)
-    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.02
+    assert abs(np.corrcoef(first.ravel(), next_frame.ravel())[0, 1]) < 0.02
     display = linear_to_srgb(first + srgb_to_linear(np.float32(0.5))) - 0.5
     assert abs(display.mean()) < 0.05 / 255
     assert draw(GRAIN, -3, flat(0.5), (WIDTH, HEIGHT)).std() > 0

@@ -38,8 +38,8 @@ def test_faces_make_one_picture_without_seams():
         ray = np.stack([*np.meshgrid(pixel, pixel), np.ones((side, side))], -1)
         return smooth((ray / np.linalg.norm(ray, axis=-1, keepdims=True)) @ rotation).astype(np.float32)
 
-    made = sphere.panorama(WIDTH, face)
-    np.testing.assert_allclose(made, smooth(true_directions(WIDTH)), atol=2e-3)
+    picture = sphere.panorama(WIDTH, face)
+    np.testing.assert_allclose(picture, smooth(true_directions(WIDTH)), atol=2e-3)
 
 
 def test_a_cap_is_filled_smoothly_and_its_share_is_told():

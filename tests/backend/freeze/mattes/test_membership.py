@@ -40,8 +40,8 @@ def test_a_vote_is_the_share_of_what_is_seen():
 
 def test_who_stands_outside_of_the_picture_is_not_seen():
     frozen = scene([[1.3, 0.0, 2.0], [0.0, 0.0, 2.0]], [0.5, 0.2], [3.0, 3.0])
-    told = vote(frozen, VIEW, K, torch.ones(24, 32, 1), torch.full((24, 32), 2.0))
-    assert told[0] == 0.0 < told[1]
+    votes = vote(frozen, VIEW, K, torch.ones(24, 32, 1), torch.full((24, 32), 2.0))
+    assert votes[0] == 0.0 < votes[1]
 
 
 def test_a_wall_that_shines_through_a_person_is_none_of_them():

@@ -35,12 +35,12 @@ def in_solve(folder):
 
 def test_the_surface_is_the_true_one(take, quiet):
     world, folder = take
-    told = make_surface(world.shot, SurfaceParams(take="solid"), quiet())
-    assert told["made"] and told["triangles"] > 500
+    result = make_surface(world.shot, SurfaceParams(take="solid"), quiet())
+    assert result["made"] and result["triangles"] > 500
     points, triangles, people, colors = in_solve(folder)
     patch = world.at((T_STAR - 101) / 15)["means"][world.moving].double().numpy()
     low, high = patch.min(0), patch.max(0)
-    off = []
+    distances = []
     for viewmat in world.viewmats:
         state = world.at((T_STAR - 101) / 15)
         shown = rasterize(**state, viewmats=viewmat[None], Ks=world.K[None], width=64, height=48, with_depth=True)
@@ -50,8 +50,8 @@ def test_the_surface_is_the_true_one(take, quiet):
         x, y = (np.floor(60 * seen[:, i] / seen[:, 2] + c).astype(int) for i, c in ((0, 32), (1, 24)))
         within = (x >= 0) & (x < 64) & (y >= 0) & (y < 48)
         depth = truth[np.clip(y, 0, 47), np.clip(x, 0, 63)]
-        off.append(np.where(within, np.abs(seen[:, 2] - depth) / depth, np.inf))
-    of_two_plates = np.sort(off, axis=0)[1]
+        distances.append(np.where(within, np.abs(seen[:, 2] - depth) / depth, np.inf))
+    of_two_plates = np.sort(distances, axis=0)[1]
     assert np.isfinite(of_two_plates).mean() > 0.9
     assert np.median(of_two_plates) < 0.01
     middles = points[triangles].mean(1)

@@ -158,8 +158,8 @@ def test_samples_are_bounded_and_one_frame_alone_stands():
     far = MotionBlur(cameras(shifted(0.0), shifted(-9.0)), 360.0)
     depth = torch.full((48, 64), 4.0)
     assert len(far.beside_middle(far.frames[0], far.frames[0].K, depth)) == far.config.most - 1
-    alone = MotionBlur(cameras(shifted(0.0)), 360.0)
-    assert alone.beside_middle(alone.frames[0], alone.frames[0].K, depth) == []
+    single = MotionBlur(cameras(shifted(0.0)), 360.0)
+    assert single.beside_middle(single.frames[0], single.frames[0].K, depth) == []
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7, 1.5])
@@ -173,6 +173,6 @@ def test_the_grain_that_a_blur_leaves_is_that_of_noise_blurred_so(softness):
     for length in (1.0, 4.0, 12.0):
         shifts = (np.arange(32) + 0.5) / 32 * length
         read = np.array([[np.interp(places + d, np.arange(400), line) for line in noise] for d in shifts])
-        found, told = read.mean(axis=0).var() / read.var(), float(kept_grain(torch.tensor(length), softness))
-        assert told == pytest.approx(found, abs=0.07)
+        found, expected = read.mean(axis=0).var() / read.var(), float(kept_grain(torch.tensor(length), softness))
+        assert expected == pytest.approx(found, abs=0.07)
     assert float(kept_grain(torch.tensor(0.0), softness)) == 1.0

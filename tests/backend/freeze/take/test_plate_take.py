@@ -36,9 +36,9 @@ RANGE = {"t_star": 105, "first": 103, "last": 108}
 def digest(path):
     """Digest of a picture's pixels and metadata without the time of writing."""
     image = oiio.ImageBuf(str(path))
-    told = image.spec().serialize("text", "detailed").splitlines()
-    told = [line for line in told if not line.strip().startswith(("DateTime", "oiio:SourcePath"))]
-    return hashlib.sha256(image.get_pixels(oiio.FLOAT).tobytes() + str(told).encode()).hexdigest()
+    lines = image.spec().serialize("text", "detailed").splitlines()
+    lines = [line for line in lines if not line.strip().startswith(("DateTime", "oiio:SourcePath"))]
+    return hashlib.sha256(image.get_pixels(oiio.FLOAT).tobytes() + str(lines).encode()).hexdigest()
 
 
 def files(folder):
@@ -99,9 +99,9 @@ def test_without_detail_splats_alone_are_left(trained, take, quiet):
     bare = world.shot.take("bare")
     assert not (bare / "warp").exists() and "detail" not in facts and "warp_dir" not in facts
     for n in (103, 108):
-        plain, made = read_frozen_exr(bare / f"{n:06d}.exr"), read_frozen_exr(folder / f"{n:06d}.exr")
+        plain, detailed = read_frozen_exr(bare / f"{n:06d}.exr"), read_frozen_exr(folder / f"{n:06d}.exr")
         assert plain.detail is None
-        splat = np.asarray(made.detail.splat)[..., :3]
+        splat = np.asarray(detailed.detail.splat)[..., :3]
         np.testing.assert_allclose(splat, plain.rgba[..., :3], rtol=4e-3, atol=1e-4)
     freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, only_missing=True), quiet())
     assert files(bare) == whole, "asked for plates, none of the old frames is right"
@@ -221,8 +221,8 @@ def bright(tmp_path_factory, world, quiet):
     for name in ("cameras.json", "points.npz"):
         shot.solve.mkdir(exist_ok=True)
         (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
-    told = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
-    (shot.solve / "solve.json").write_text(json.dumps(told))
+    record = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
+    (shot.solve / "solve.json").write_text(json.dumps(record))
     for n in range(101, 117):
         write_png(shot.frames / f"{n:06d}.png", read_png(shot.frames / "raw" / f"{n:06d}.png"))
         path = shot.root / PAINTED / f"{n:06d}.png"
@@ -310,16 +310,16 @@ def test_a_lamp_is_a_lamp_in_splats_alone(lit, quiet):
     frame = read_frozen_exr(lit.take("freeze") / "000106.exr")
     source = oiio.ImageBuf(str(lit.root.parent / "source" / "a.106.exr")).get_pixels(oiio.FLOAT)
     inside = binary_erosion(source[..., 1] > 10.0)
-    away = ~binary_dilation(source[..., 1] > 10.0, iterations=4)
-    assert inside.sum() > 20 and away.sum() > 1000
+    far = ~binary_dilation(source[..., 1] > 10.0, iterations=4)
+    assert inside.sum() > 20 and far.sum() > 1000
     assert np.median(frame.rgba[..., :3][inside]) == pytest.approx(LAMP, rel=0.3)
-    off = linear_to_srgb(frame.rgba[..., :3][away]) - linear_to_srgb(source[away])
-    assert np.abs(off).mean() < 0.03 and frame.rgba[..., :3][away].max() < 2.0
+    difference = linear_to_srgb(frame.rgba[..., :3][far]) - linear_to_srgb(source[far])
+    assert np.abs(difference).mean() < 0.03 and frame.rgba[..., :3][far].max() < 2.0
     assert frame.rgba.max() < 1.01 * LAMP
     assert np.abs(frame.grain[inside]).max() < 0.1, "grain is not what a lamp flickers by"
     preview = read_png(lit.take("freeze") / "preview" / "000106.png") / 255.0
     shown = ROLLED.from_light(frame.rgba[..., :3])
-    assert facts["grain"] is not None and np.abs(preview - shown)[away].max() < 1.5 / 255
+    assert facts["grain"] is not None and np.abs(preview - shown)[far].max() < 1.5 / 255
     assert 0.9 < np.median(preview[inside]) < 1.0
 
 

@@ -64,11 +64,11 @@ def single(*values):
 def test_it_is_what_float64_says(plate, with_ignored):
     points, viewmat, K, surface, ignored = plate
     ignored = ignored if with_ignored else np.zeros_like(ignored)
-    given = single(points, viewmat, K, surface, ignored)
-    given = given if with_ignored else [*given[:-1], None]
+    inputs = single(points, viewmat, K, surface, ignored)
+    inputs = inputs if with_ignored else [*inputs[:-1], None]
     # Inputs are rounded to float32 first, so that only the arithmetic is tested.
     rounded = [np.asarray(v, np.float32).astype(float) for v in (points, viewmat, K, surface, ignored)]
-    found, expected = visible_pixels(*given, TOLERANCE, SOFT), reference(*rounded)
+    found, expected = visible_pixels(*inputs, TOLERANCE, SOFT), reference(*rounded)
     clear = np.abs(expected[1]) > 1e-3  # near the camera's plane, rounding decides which points are in front
     assert (expected[2] > 0.5).sum() > 100 and (expected[1] < 0).sum() > 500
     for name, mine, theirs in zip(("depth", "moving", "explained"), (found.depth, found.moving, found.explained),
