@@ -47,7 +47,8 @@ def footage(scene, shot, tmp_path):
         facts |= {"width": make_detail.WIDTH, "height": make_detail.HEIGHT, "first": 5, "last": 6, "camera_path": ""}
         facts["footage"] = {
             "file": str(folder / "000005.exr"), "beside": "", "size": [make_detail.WIDTH, make_detail.HEIGHT],
-            "first": 5, "last": 6, "probe": [0.78125, 0.390625, 0.1953125], "space": "linear, Rec.709", "unlike": reason,
+            "first": 5, "last": 6, "probe": [0.78125, 0.390625, 0.1953125],
+            "space": "linear, Rec.709", "unlike": reason,
             "map": "stmap/undistort.exr" if lens else "",
         }  # fmt: skip
         (take / "take.json").write_text(json.dumps(facts))
