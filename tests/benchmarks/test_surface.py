@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.surface import figures, off_truth
+from benchmarks.surface import distance_from_truth, figures
 from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.regions import View
 
@@ -25,7 +25,7 @@ def test_a_place_is_as_far_off_as_from_the_nearest_surface_that_two_plates_see()
     truth = RayScene(np.concatenate([wall, card]), np.concatenate([faces, faces + 4]))
     views = [camera(-0.1), camera(0.0), camera(0.1)]
     places = np.array([[1.8, 0, 5.05], [1.8, 0, 4.5], [0.1, 0, 2.04], [0.3, 0, 4.9], [-2.85, 0, 5.0], [2.0, 1.0, 5.0]])
-    errors = off_truth(places, truth, views)
+    errors = distance_from_truth(places, truth, views)
     np.testing.assert_allclose(errors[[0, 1, 2, 5]], [0.01, 0.1, 0.02, 0.0], atol=1e-6)
     assert errors[3] == np.inf, "the card hides the wall there"
     assert errors[4] == np.inf, "one camera sees it"

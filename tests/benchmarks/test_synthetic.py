@@ -35,7 +35,7 @@ from benchmarks.synthetic.shot import (
     similarity_to_exact,
     surface_points,
 )
-from benchmarks.synthetic.sizes import HARD, HELD, KINDS, REPORT_SEEDS, SIZES, THING, TUNING_SEEDS
+from benchmarks.synthetic.sizes import HARD, HELD, KINDS, OBJECT_PREFIX, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import CameraFrame, CameraPath, Reporter, read_json
 from torch_backend.footage.images import read_png
 from torch_backend.scene import load_scene
@@ -343,7 +343,7 @@ def test_a_hard_scene_is_what_it_was(kind, hard):
 @pytest.mark.parametrize("kind", [kind for kind in HARD if kind != HELD])
 def test_a_hard_scene_has_its_thing_in_view(kind, hard):
     maps = seen_from(hard[kind], kind, 8, 4)
-    masks = {name.removeprefix(THING): mask for name, mask in maps.items() if name.startswith(THING)}
+    masks = {name.removeprefix(OBJECT_PREFIX): mask for name, mask in maps.items() if name.startswith(OBJECT_PREFIX)}
     assert set(masks) == ({"glass", "mirror", "wall"} if kind == "glass" else {kind})
     for mask in masks.values():
         assert 1e-4 < mask.mean() < 0.5
@@ -379,7 +379,7 @@ def test_what_is_behind_a_thing_is_rendered_around_it(kind, hard):
     behind = {Path(job["out"]).name: job for job in plan["jobs"] if "box" in job}
     assert set(behind) == {"000001.png", "000005.png", "000009.png"}
     for pose in (0, 4, 8):
-        mask = seen_from(hard[kind], kind, 8, pose)[THING + kind]
+        mask = seen_from(hard[kind], kind, 8, pose)[OBJECT_PREFIX + kind]
         left, top, right, bottom = FINER * np.array(behind[f"{pose + 1:06d}.png"]["box"])
         inside = np.zeros_like(mask)
         inside[top:bottom, left:right] = True
@@ -406,12 +406,12 @@ def test_a_mirror_shows_the_room_and_a_thing_can_be_taken_away(hard, tmp_path):
     (dark,) = render("glass", "dark", reflects={"glass": 1.0, "mirror": 0.0})
     geometry, views = Geometry.load(hard["glass"]), views_of(SEED, TINY, "glass")
     maps = region_maps(geometry, geometry.at(0), 0, views[0], views[0])
-    mirror, wall, glass = (ndimage.binary_erosion(maps[THING + name]) for name in ("mirror", "wall", "glass"))
+    mirror, wall, glass = (ndimage.binary_erosion(maps[OBJECT_PREFIX + name]) for name in ("mirror", "wall", "glass"))
     changed = np.abs(shown - dark).mean(axis=2)
     assert np.median(changed[mirror]) > 10 and np.median(changed[glass]) > 2 and np.median(changed[wall]) < 1
     truth, behind = render("arm", "arm")
     geometry, views = Geometry.load(hard["arm"]), views_of(SEED, TINY, "arm")
-    arm = region_maps(geometry, geometry.at(8), 8, views[8], views[8])[THING + "arm"]
+    arm = region_maps(geometry, geometry.at(8), 8, views[8], views[8])[OBJECT_PREFIX + "arm"]
     assert (behind[arm].sum(axis=1) > 0).all() and (np.abs(truth - behind).mean(axis=2)[arm] > 15).mean() > 0.5
 
 

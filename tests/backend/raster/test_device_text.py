@@ -23,7 +23,7 @@ def launches():
         pytest.skip("the emulator needs a C++ compiler (c++, g++ or clang++), and there is none")
     noted = device_text.Launches()
     hits = device_text.note_scenes(noted)
-    device_text.note_others(noted)
+    device_text.note_training_kernels(noted)
     return noted, hits
 
 

@@ -15,10 +15,10 @@ from benchmarks.ablate.__main__ import Ablation, tables
 from benchmarks.ablate.cases import TUNED_AT, Case, drawn, pairs_of
 from benchmarks.ablate.instants import Instants, digest
 from benchmarks.ablate.measures import FrameMaker, summary
-from benchmarks.ablate.switches import COMBINATIONS, FRAME, RULES, detail_config, replaced, switched_off, variants
+from benchmarks.ablate.switches import COMBINATIONS, FRAME, RULES, detail_config, replaced, rules_disabled, variants
 from benchmarks.ablate.table import TRUTH, Store, sweep_table, table
 from benchmarks.detail_clip import open_clip
-from benchmarks.other_state import OTHER, Painted, Pair, Polygon
+from benchmarks.other_state import CHANGED, Painted, Pair, Polygon
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def current_value(switch):
 @pytest.mark.parametrize("rule", RULES.values(), ids=lambda rule: rule.name)
 def test_a_rule_is_off_and_on_again(rule):
     before = [current_value(switch) for switch in rule.switches]
-    with pytest.raises(ArithmeticError), switched_off(frozenset({rule.name})):
+    with pytest.raises(ArithmeticError), rules_disabled(frozenset({rule.name})):
         assert all(current_value(switch) is not was for switch, was in zip(rule.switches, before, strict=True))
         raise ArithmeticError  # restored even if the measurement fails
     assert [current_value(switch) for switch in rule.switches] == before
@@ -155,7 +155,9 @@ def test_digests_tell_content_and_not_objects():
 def test_what_is_let_go_is_held_against_what_was_painted(clip, tmp_path, monkeypatch):
     """The whole plate is painted as another state, so the removed fraction of a frame is its IoU."""
     t_star, frame = clip.run.train_frames[6], clip.run.train_frames[2]
-    whole = Polygon(np.array([(0, 0), (clip.width, 0), (clip.width, clip.height), (0, clip.height)], float), "", OTHER)
+    whole = Polygon(
+        np.array([(0, 0), (clip.width, 0), (clip.width, clip.height), (0, clip.height)], float), "", CHANGED
+    )
     painted = Painted("tiny", "", clip.width, clip.height, (Pair(t_star, frame, 0, (whole,)),))
     case, store = Case("tiny", clip, [], None), Store(tmp_path)
     masks.judge_masks(case, store)

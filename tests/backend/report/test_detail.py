@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import detail, detail_cost, detail_flow, detail_truth
 from benchmarks.detail_clip import VARIANTS, open_clip
-from benchmarks.other_state import OTHER, Painted, Pair, Polygon, score
+from benchmarks.other_state import CHANGED, Painted, Pair, Polygon, score
 from benchmarks.other_state import __main__ as other_state_main
 from torch_backend.footage.images import read_png
 from torch_backend.footage.plates import Plates
@@ -66,7 +66,7 @@ def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
 def test_what_is_let_go_of_is_scored_against_painted_masks(shot, capsys, tmp_path):
     clip = open_clip(shot.root, develop=False)
     t_star, frame = clip.frames[8], clip.frames[12]
-    whole = Polygon(np.array([(0, 0), (64, 0), (64, 48), (0, 48)], float), "everything", OTHER)
+    whole = Polygon(np.array([(0, 0), (64, 0), (64, 48), (0, 48)], float), "everything", CHANGED)
     pairs = (Pair(t_star, t_star, 2, (whole,)), Pair(t_star, frame, 2, (whole,)), Pair(t_star, frame, 2, ()))
     itself, all_changed, all_same = (row.counts["delivered"] for row in score(clip, Painted("tiny", "", 64, 48, pairs)))
     assert itself.recall == 0.0, "plate t* shows t*"

@@ -123,7 +123,7 @@ def test_the_report_tells_of_glass_and_small_movers(tmp_path):
         "auto (ours)", "20.00", "–", "26.02", "-6.02", "–", "2.0%", "–", "3.0% (40.0%)", "–",
     ]  # fmt: skip
     assert delivered[6] == "–", "plate detail opens nothing"
-    assert tables["Small movers, and hair"].rows == [
+    assert tables["Small moving objects and hair"].rows == [
         ["auto (ours)", "0.80", "0.50", "–", "–", "–", "–"],
         ["auto (ours), plate detail", "0.90", "0.90", "–", "–", "–", "–"],
     ]
@@ -134,4 +134,4 @@ def test_other_scenes_have_no_such_tables():
     for row in rows.rows:
         row.recalled, row.opened, row.regions = {}, {}, {"whole": row.regions["whole"]}
     rows.matte, rows.detailed = {}, {}
-    assert not {"Glass and mirrors", "Small movers, and hair"} & {table.title for table in all_tables([rows])}
+    assert not {"Glass and mirrors", "Small moving objects and hair"} & {table.title for table in all_tables([rows])}
