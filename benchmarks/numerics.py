@@ -78,7 +78,10 @@ def _cases(bodies: list[str], names: list[str]) -> list[str]:
         title = f"{name}: {case.note}" if case.note else name
         lines.append(f"| {title} | {' | '.join(map(_errors, errors))} | {bounds} |")
     close = len(names) - len(lines) + 2
-    summary = f"In the other {close} cases, every body reaches {_CLOSE[0]:.0f} dB, with gradient errors up to {_cell(_CLOSE[1])}."
+    summary = (
+        f"In the other {close} cases, every body reaches {_CLOSE[0]:.0f} dB, with gradient errors up to "
+        f"{_cell(_CLOSE[1])}."
+    )
     return [*lines, "", summary]
 
 
@@ -140,16 +143,16 @@ def report(bodies: list[str], names: list[str], cases: int) -> str:
         "",
         f"{datetime.date.today().isoformat()}; {_machine()}.",
         "",
-        "`dB` is the PSNR of the pixels without flips, for a peak of 1 or of the brightest channel. `flips` is the share "
-        "of the other pixels. Gradient errors are relative L2 errors.",
+        "`dB` is the PSNR of the pixels without flips, for a peak of 1 or of the brightest channel. `flips` is the "
+        "share of the other pixels. Gradient errors are relative L2 errors.",
         "",
         "Bodies: `cpu` is compiled float32, `reference32` the torch reference in float32, `cuda` the CUDA kernels on "
         "CPU fibers (smaller scenes).",
         "",
         "## Two rooms",
         "",
-        "W0: 400 Gaussians, 64 x 48. W1: 20,000 Gaussians, 320 x 180. Gradients are those of a randomly weighted sum of "
-        "colours and alphas over the pixels without flips.",
+        "W0: 400 Gaussians, 64 x 48. W1: 20,000 Gaussians, 320 x 180. Gradients are those of a randomly weighted sum "
+        "of colours and alphas over the pixels without flips.",
         "",
         *_workloads(bodies),
         "",

@@ -146,8 +146,8 @@ def figures(rows: Sequence[dict[str, Any]], region: str) -> tuple[float, float] 
 def table(found: dict[str, list[dict[str, Any]]]) -> list[str]:
     """Figures by scene, pair and person, in Markdown."""
     lines = [
-        "| scene | base, instant | person | matte IoU | whole: separate, combined, loss | person: separate, combined, loss "
-        "| unknown: share, combined |",
+        "| scene | base, instant | person | matte IoU | whole: separate, combined, loss "
+        "| person: separate, combined, loss | unknown: share, combined |",
         "|---|---|---|---:|---:|---:|---:|",
     ]
     for scene, rows in found.items():

@@ -69,7 +69,7 @@ def annotated_calls(tree: ast.AST) -> list[int]:
     return [n.lineno for n in found if any(isinstance(part, ast.Call) for part in ast.walk(n.annotation))]
 
 
-def test_properties_of_the_addon_are_assigned_so_that_their_type_is_known():
+def test_addon_properties_are_assigned_with_known_types():
     """`splannequin_addon/properties.py` explains how."""
     for path in sorted((ROOT / "splannequin_addon").rglob("*.py")):
         assert not annotated_calls(ast.parse(path.read_text(encoding="utf-8"))), path

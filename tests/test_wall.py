@@ -225,7 +225,7 @@ def unplaced_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("folder", ["splannequin_addon", "torch_backend", "benchmarks", "launcher"])
-def test_no_python_is_started_that_takes_modules_from_where_it_stands(folder: str):
+def test_no_python_is_started_without_safe_path(folder: str):
     for path in sources(folder) if (ROOT / folder).is_dir() else [ROOT / folder]:
         wrong = list(unsafe_children(read(path)))
         if folder in ("splannequin_addon", "torch_backend"):
@@ -352,7 +352,7 @@ def test_the_scan_sees_a_circle():
     assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
 
 
-def test_only_one_file_of_the_addon_imports_others_for_the_type_checker():
+def test_only_one_addon_file_imports_for_type_checking():
     """Every file may import bpy's types. A room that needs data of a later room gets it through `access`."""
 
     for_types = {
@@ -403,11 +403,11 @@ def backwards(arrows: dict[str, set[str]]) -> list[str]:
     return wrong
 
 
-def test_no_modules_of_the_addon_import_each_other():
+def test_addon_modules_have_no_import_cycles():
     assert circles(addon_modules()) == []
 
 
-def test_no_file_of_the_addon_stands_on_a_high_tower_of_imports():
+def test_addon_import_depth_is_bounded():
     arrows = addon_modules()
     assert len(arrows) > 60
     high = {module: level(module, arrows) for module in arrows}
@@ -462,7 +462,7 @@ def part_of(name: str, package: str) -> str:
 
 
 @pytest.mark.parametrize("package", [*packages("launcher"), *packages("torch_backend"), *packages("benchmarks")])
-def test_no_files_and_folders_of_a_package_import_each_other(package: str):
+def test_packages_have_no_import_cycles(package: str):
     """At any depth, and also for type names: a file that names another's class depends on it."""
     arrows: dict[str, set[str]] = {}
     for path in sources(package.replace(".", "/")):

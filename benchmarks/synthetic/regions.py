@@ -10,7 +10,7 @@ In a mirror the reflected point counts: it is seen at t* if the mirror shows it 
 glass either layer may move; *seen* refers to the point behind the glass. Depth is the mirror's own, and that of the
 point behind glass.
 
-Hard scenes have masks of their things (`Regions.objects`). `glass` and `mirror` are the pixels of panes in which nothing
+Hard scenes have masks of objects (`Regions.objects`). `glass` and `mirror` are the pixels of panes in which nothing
 moves, `wall` those of the surrounding still wall within `WALL_METRES` of a pane. `swinging`, `arm` and `hair` are the
 pixels whose centre shows the thing. Hair is thinner than a pixel: a pixel is hair if at least `HAIR_SHARE` of
 `HAIR_RAYS` squared rays through it hit a strand. Scenes of kind `held` have a mask per held thing, and the region

@@ -139,7 +139,7 @@ def test_what_is_no_such_file_is_refused_in_a_sentence(addon, contract, filmed, 
         addon("process.steps").STEPS["solve"].params(filmed)
 
 
-def test_the_timer_waits_for_the_other_blender_and_ends_it_when_given_up(addon, filmed, shot, tmp_path):
+def test_timer_waits_for_the_second_blender_and_kills_it_on_cancel(addon, filmed, shot, tmp_path):
     animated(filmed, "match")
     file = tmp_path / "set.fbx"
     export(file)

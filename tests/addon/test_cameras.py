@@ -29,7 +29,7 @@ def test_identity_camera_looks_along_z_with_y_down(addon):
     np.testing.assert_allclose(matrix @ [1, 0, 0, 0], [1, 0, 0, 0])
 
 
-def test_translation_moves_the_camera_the_other_way(addon):
+def test_root_translation_is_inverted_for_the_camera(addon):
     viewmat = np.eye(4)
     viewmat[:3, 3] = (1, 2, 3)
     np.testing.assert_allclose(addon("scene.axes").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
@@ -129,7 +129,7 @@ def test_plate_fits_the_sensor_and_follows_the_frame_numbers(addon, scene, shot)
     assert (user.frame_start, user.frame_offset, user.frame_duration) == (5, 4, 3)
 
 
-def test_points_keep_their_colours(addon, scene, shot):
+def test_point_cloud_has_stored_colours_and_positions(addon, scene, shot):
     addon("solve.cameras").build(scene, shot)
     cloud = addon("solve.cameras").find(scene, shot, "MESH")
     stored = np.load(shot / "solve" / "points.npz")
@@ -425,7 +425,7 @@ def test_reading_a_camera_can_be_cancelled(read_on, moving, shot):
     assert not read_on.failures and not (shot / "jobs").exists()
 
 
-def test_reading_a_camera_ends_with_its_file_and_leaves_the_next_one_alone(read_on):
+def test_reading_a_camera_stops_when_the_file_closes(read_on):
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     assert read_on.work is None and bpy.context.scene.name == "Scene"
     assert bpy.context.scene.frame_current == 1
@@ -478,7 +478,7 @@ def test_a_keyed_instant_is_followed_frame_by_frame(addon, scene, shot):
     assert steps.STEPS["freeze"].params(scene).t_star_per_frame == {}
 
 
-def test_points_keep_their_own_colours(addon, scene, shot):
+def test_points_are_drawn_with_their_colours(addon, scene, shot):
     """Points are drawn over the view with colours. Blender draws loose points black, so the object shows only its
     bounds."""
     cameras = addon("solve.cameras")

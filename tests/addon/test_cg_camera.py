@@ -49,7 +49,7 @@ def bake(addon, scene, folder: Path) -> list[int]:
     return addon("bake.rendering").render(scene, folder, check=addon("bake.cg_camera").check)
 
 
-def test_the_clips_own_camera_is_right(addon, solved, shot, tmp_path):
+def test_clip_camera_is_accepted_for_cg(addon, solved, shot, tmp_path):
     before = solved.camera
     assert addon("bake.insertion").combine_cg(solved, shot)
     assert solved.camera == before
@@ -120,7 +120,7 @@ def test_a_take_of_the_artists_camera_is_combined_through_it(addon, contract, so
     assert "Make Mine the scene's camera" in failure.value.hint
 
 
-def test_another_take_beside_cg_is_said_when_it_is_inserted_and_refused_when_it_is_baked(
+def test_second_take_with_cg_warns_on_insert_and_is_refused_on_bake(
     addon, contract, solved, shot, artists_take, tmp_path
 ):
     addon("bake.insertion").combine_cg(solved, shot)
@@ -162,7 +162,7 @@ def shown(addon, scene) -> str:
 
 
 @pytest.mark.parametrize("kind", ["FULL_COPY", "LINK_COPY"])
-def test_a_take_baked_in_a_copy_of_a_scene_leaves_the_other_scenes(addon, solved, shot, new_take, kind):
+def test_bake_in_a_copied_scene_does_not_change_the_original(addon, solved, shot, new_take, kind):
     new_take(shot, "second")
     addon("bake.insertion").combine_cg(solved, shot)
     bpy.ops.scene.new(type=kind)

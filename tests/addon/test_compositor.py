@@ -121,7 +121,7 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
     assert not bpy.data.node_groups and not [i for i in bpy.data.images if i.source == "SEQUENCE"]
 
 
-def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, shot):
+def test_prefetched_pictures_are_used_on_arrival(addon, scene, artists_tree, shot):
     bake = addon("bake.insertion")
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
     assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 1, "the artist's tree shows no plate of ours"
@@ -132,7 +132,7 @@ def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, 
     assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
 
 
-def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, shot, tmp_path, pictures):
+def test_prefetched_pictures_are_read_again_for_the_next_bake(addon, scene, shot, tmp_path, pictures):
     bake, plate = addon("bake.insertion"), shot / "frames" / "000005.png"
     for value in (40, 200):  # stands for a first bake that ended before insertion
         pictures.write(plate, np.full((12, 16, 3), value, np.uint8))
@@ -146,7 +146,7 @@ def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, s
     assert np.abs(pictures.read(tmp_path / "out" / "000005.png") * 255 - 200).max() < 0.6
 
 
-def test_compositor_that_was_off_is_said_and_put_back(addon, scene, artists_tree, take):
+def test_enabling_the_compositor_is_reported_and_undone(addon, scene, artists_tree, take):
     compat = addon("compat")
     switches = {name: False for name in compat.compositor_switches(scene)}
     compat.restore_compositor_switches(scene, switches)

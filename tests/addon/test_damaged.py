@@ -104,7 +104,7 @@ def mutated(value: object, random_: random.Random) -> object:
     return value
 
 
-def test_files_with_anything_in_them_are_passed_over_or_told(look, full_shot):
+def test_damaged_files_are_skipped_or_reported(look, full_shot):
     random_ = random.Random(13)  # noqa: S311
     files = [f for f in files_of(full_shot) if f.suffix in (".json", ".jsonl")]
     for n in range(400):

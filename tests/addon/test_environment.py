@@ -126,7 +126,7 @@ def at_work(folder) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
-def test_what_a_process_of_others_works_with_is_not_removed(addon, existing_environment):
+def test_environment_in_use_by_another_process_is_not_removed(addon, existing_environment):
     """A job of another Blender or of a command line is unknown to this Blender."""
     with at_work(existing_environment) as process:
         try:
@@ -177,7 +177,7 @@ def system(addon, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(bpy.app.online_access_override, reason="this Blender was started online or offline for good")
-def test_offline_the_button_says_so_and_goes_online_only_when_it_is_told_to(system, tmp_path):
+def test_offline_button_asks_before_going_online(system, tmp_path):
     assert bpy.ops.splannequin.set_up.poll(), "a grey button offers nothing"
     with pytest.raises(RuntimeError, match="may not go online"):
         bpy.ops.splannequin.set_up()

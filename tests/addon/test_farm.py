@@ -44,7 +44,7 @@ def test_the_button_writes_a_job_with_what_the_artist_set(scene, imported, tmp_p
     assert places == str([str(imported)])
 
 
-def test_the_button_is_on_once_there_is_something_to_export(scene, shot):
+def test_export_button_is_enabled_once_something_can_be_exported(scene, shot):
     """Also in a script, where no timer reads the folder."""
     scene.splannequin.shot_path = str(shot)
     (shot / "shot.json").rename(shot / "away")
@@ -61,7 +61,7 @@ def test_the_button_says_what_is_wrong(scene, imported, tmp_path, contract):
         bpy.ops.splannequin.export_for_farm()
 
 
-def test_the_verb_writes_what_the_backends_own_does(run, imported, tmp_path, addon):
+def test_addon_verb_writes_the_same_files_as_the_backend(run, imported, tmp_path, addon):
     out = tmp_path / "job"
     words = ["--t-star", "5,7", "--frames", "2", "--freeze-width", "48", "--device", "cpu"]
     code, said, err = run("farm", "export", imported, "--output", out, *words)
@@ -102,7 +102,7 @@ def test_a_part_of_a_bake_freezes_nothing(run, shot, tmp_path):
     assert code == 7 and "a part of a bake freezes none" in err and sys.executable not in err
 
 
-def test_what_the_shot_lacks_is_asked_for_and_nothing_else(scene, imported, addon, contract):
+def test_farm_export_requests_only_missing_steps(scene, imported, addon, contract):
     scene.splannequin.shot_path = str(imported)
     shot_folder = contract.ShotFolder(imported)
     assert set(addon("bake.farm").requests_of(scene, imported)) == {"freeze"}, "it is solved, and has this run"
@@ -113,7 +113,7 @@ def test_what_the_shot_lacks_is_asked_for_and_nothing_else(scene, imported, addo
     assert set(addon("bake.farm").requests_of(scene, imported)) == {"solve", "train", "freeze"}
 
 
-def test_no_request_is_written_where_there_is_no_backend(addon, tmp_path, monkeypatch, contract):
+def test_no_request_is_written_without_a_backend(addon, tmp_path, monkeypatch, contract):
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "absent"))
     with pytest.raises(contract.JobError, match="does not exist"):
         addon("bake.farm_job").begin(contract.FarmWords(output=str(tmp_path / "job")), {})

@@ -241,7 +241,7 @@ def test_both_command_lines_print_the_same_options_for_the_same_verb(addon, pack
         assert ours[verb] == theirs[verb], verb
 
 
-def test_freeze_of_a_shot_is_the_step_alone(run, root, tmp_path):
+def test_freeze_of_a_shot_runs_only_that_step(run, root, tmp_path):
     shot = tmp_path / "stored.splannequin"
     shutil.copytree(root / "tests" / "data" / "shot", shot)
     words = ("--run", "tiny", "--t-star", 8, "--take", "again", "--detail", "off", "--develop", "off",
@@ -255,7 +255,7 @@ def test_freeze_of_a_shot_is_the_step_alone(run, root, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tmp_path):
+def test_command_line_options_reach_the_backend(addon, contract, monkeypatch, tmp_path):
     headless = addon("command_line.headless")
     monkeypatch.setattr(addon("process.backend"), "device", lambda: "cpu")  # stands for a choice in the preferences
 

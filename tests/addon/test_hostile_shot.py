@@ -58,14 +58,14 @@ def test_a_job(addon, contract, trap, hostile, shot, root):
     assert not trap.exists(), trap.read_text()
 
 
-def test_a_child_stands_beside_its_interpreter(addon, contract):
+def test_child_runs_in_the_folder_of_its_interpreter(addon, contract):
     """Windows loads libraries from the working folder, and locks that folder against moving."""
     python = addon("process.backend").python()
     child = contract.python_child(python, "torch_backend", "doctor")
     assert child["cwd"] == os.path.dirname(os.path.abspath(python))
 
 
-def test_a_program_beside_the_blend_file_is_none_of_the_path(contract, tmp_path, monkeypatch):
+def test_programs_next_to_the_blend_file_are_not_on_the_path(contract, tmp_path, monkeypatch):
     fake = tmp_path / "nvidia-smi"
     fake.write_text("#!/bin/sh\n")
     fake.chmod(0o755)

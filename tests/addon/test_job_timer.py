@@ -81,7 +81,7 @@ def test_a_shot_that_cannot_be_read_for_a_moment_is_read_again(contract, supervi
     assert "import" not in watch.failures
 
 
-def test_one_that_breaks_does_not_end_the_timer_for_the_others(supervisor, capfd):
+def test_failing_callback_does_not_stop_the_timer(supervisor, capfd):
     calls = []
     supervisor.meanwhile(lambda: 1 / 0)
     supervisor.meanwhile(lambda: len(calls) < 2 and not calls.append(len(calls)))
@@ -91,7 +91,7 @@ def test_one_that_breaks_does_not_end_the_timer_for_the_others(supervisor, capfd
     assert capfd.readouterr().err.count("ZeroDivisionError") == 1
 
 
-def test_a_bake_whose_frames_are_there_comes_in_in_turns(addon, contract, supervisor, watch, shot):
+def test_bake_with_finished_frames_is_inserted_step_by_step(addon, contract, supervisor, watch, shot):
     """The turns are: read a picture, read the next, change the compositor, render. Blender blocks during each turn."""
     params = contract.FreezeParams(take="freeze")
     job = addon("process.jobs").new_job(shot, "freeze", params)
@@ -132,7 +132,7 @@ def baked(addon) -> list[str]:
     return [s.name for s in bpy.data.scenes if tree(s) is not None and group_node(tree(s)) is not None]
 
 
-def test_a_bake_comes_into_the_scene_where_it_was_asked_for_alone(addon, contract, supervisor, watch, shot):
+def test_bake_is_inserted_only_into_the_requesting_scene(addon, contract, supervisor, watch, shot):
     second_scene = bpy.data.scenes.new("A lookdev")
     second_scene.splannequin.shot_path = str(shot)
     before = second_scene.view_settings.view_transform
@@ -167,7 +167,7 @@ def test_a_bake_comes_into_its_scene_though_that_is_renamed_meanwhile(addon, con
     assert baked(addon) == ["renamed again"] and not watch.failures
 
 
-def test_a_bake_whose_scene_is_deleted_while_it_comes_in_changes_no_other(addon, contract, supervisor, watch, shot):
+def test_bake_of_a_deleted_scene_changes_no_other_scene(addon, contract, supervisor, watch, shot):
     second_scene = bpy.data.scenes.new("A lookdev")
     second_scene.splannequin.shot_path = str(shot)
     ended_bake(addon, contract, supervisor, watch, shot, "A lookdev", second_scene.session_uid)
@@ -177,7 +177,7 @@ def test_a_bake_whose_scene_is_deleted_while_it_comes_in_changes_no_other(addon,
     assert watch.work is None and baked(addon) == [] and not watch.failures
 
 
-def test_a_bake_of_a_scene_that_has_another_shot_now_is_only_told_of(addon, contract, supervisor, watch, shot):
+def test_bake_is_only_reported_if_the_scene_changed_its_shot(addon, contract, supervisor, watch, shot):
     second_scene = bpy.data.scenes.new("A lookdev")
     second_scene.splannequin.shot_path = str(shot)
     bpy.data.scenes["Scene"].splannequin.shot_path = str(shot.parent / "another.splannequin")
@@ -195,7 +195,7 @@ def test_a_job_keeps_the_name_of_its_scene(addon, contract, scene, shot):
     assert addon("process.steps").scene_of(found) == "Comp é" and addon("process.steps").step_of(found) == "bake"
 
 
-def test_a_job_names_the_blend_that_it_was_started_from_in_every_other_one(addon, contract, scene, shot):
+def test_job_names_the_blend_file_that_started_it(addon, contract, scene, shot):
     started_in = addon("ui.step_panel").started_elsewhere
     scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), "freeze"
     bpy.ops.wm.save_as_mainfile(filepath=str(shot.parent / "a é.blend"))
@@ -386,7 +386,7 @@ def solving(addon, contract, supervisor, watch, shot):
     job.process.wait()
 
 
-def test_the_camera_arrives_while_the_solve_goes_on_and_its_end_leaves_it_alone(addon, scene, shot, watch, solving):
+def test_camera_arrives_during_the_solve_and_is_not_replaced_at_its_end(addon, scene, shot, watch, solving):
     job, tell = solving
     find = addon("solve.cameras").find
     tell("progress", stage="solve", done=1, total=2, message="")

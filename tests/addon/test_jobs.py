@@ -163,7 +163,7 @@ def test_the_childs_environment_is_free_of_blenders_python(addon, monkeypatch, r
     assert "PYTHONHOME" not in environ and environ["PYTHONPATH"] == str(root)
 
 
-def test_an_answer_that_no_pipe_holds_is_read_while_it_is_given(addon, tmp_path):
+def test_answer_larger_than_a_pipe_is_read_while_written(addon, tmp_path):
     """An unread pipe holds 64 KB on Linux and 4 KB on Windows; the traceback of a library that fails to load is
     longer."""
     (tmp_path / "torch_backend").mkdir()
@@ -194,7 +194,7 @@ def test_new_job_refuses_the_parameters_of_another_kind(addon, contract, empty_s
         addon("process.jobs").new_job(empty_shot, "train", contract.SolveParams())
 
 
-def test_a_broken_write_leaves_what_was_there(contract, tmp_path):
+def test_failed_write_keeps_the_previous_file(contract, tmp_path):
     target = tmp_path / "a.json"
     contract.write_json(target, {"a": 1})
     with pytest.raises(ValueError):
@@ -202,7 +202,7 @@ def test_a_broken_write_leaves_what_was_there(contract, tmp_path):
     assert json.loads(target.read_text()) == {"a": 1} and [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_cancel_pressed_again_does_not_put_off_the_end_by_force(addon, contract, empty_shot):
+def test_second_cancel_does_not_delay_the_kill(addon, contract, empty_shot):
     jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     jobs.cancel(job)

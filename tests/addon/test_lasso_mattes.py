@@ -116,7 +116,7 @@ def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, 
     assert not single.exists()
 
 
-def test_what_cannot_be_made_is_a_sentence(addon, chosen, world):
+def test_uncreatable_paths_give_a_readable_error(addon, chosen, world):
     mattes, scene = addon("freeze.mattes"), bpy.context.scene
     with pytest.raises(addon("freeze.mattes").contract.JobError, match="No mask"):
         mattes.params_of(scene, world[0])
@@ -139,7 +139,7 @@ def test_drawing_begins_with_a_mask_and_is_undone(addon, chosen, world):
     assert (first, last) == (104, 110) and image.source == "SEQUENCE"
 
 
-def test_lassos_of_a_stranger_are_not_believed(addon, contract, shot):
+def test_untrusted_lasso_files_are_validated(addon, contract, shot):
     record = contract.TakeFolder(shot / "takes" / "freeze").mattes_record
     record.parent.mkdir(parents=True)
     rows = [{"name": "../x", "frame": 1, "polygon": []}, {"name": "ok", "frame": True, "polygon": []}, 7]

@@ -190,14 +190,14 @@ def test_a_take_without_a_warp_is_refused_in_a_sentence(addon, contract, scene, 
         bpy.ops.splannequin.freeze_as_warp()
 
 
-def test_a_take_from_a_camera_of_the_artists_own_is_refused_in_a_sentence(addon, contract, scene, detailed, graded):
+def test_warp_of_a_take_with_an_artists_camera_is_refused_readably(addon, contract, scene, detailed, graded):
     file = detailed / "takes" / "detail" / "take.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "camera_path": "/somewhere/path.json"}))
     with pytest.raises(contract.JobError, match="looks into other frames of the plate"):
         addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
 
 
-def test_a_bake_of_a_take_without_a_warp_shows_its_frames_and_says_so(addon, scene, detailed, graded):
+def test_bake_without_a_warp_shows_frames_and_warns(addon, scene, detailed, graded):
     addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     said = addon("bake.insertion").insert_freeze(scene, detailed, "freeze")
     assert "The take has no warp: its own frames are shown." in said and "As Warp" not in node_of(addon, scene).inputs
@@ -205,7 +205,7 @@ def test_a_bake_of_a_take_without_a_warp_shows_its_frames_and_says_so(addon, sce
     assert "As Warp" in node_of(addon, scene).inputs, "the next take that has one is used as such again"
 
 
-def test_pictures_read_ahead_for_a_warp_are_those_that_come_in(addon, scene, detailed, graded):
+def test_prefetched_warp_pictures_are_used_on_arrival(addon, scene, detailed, graded):
     bake = addon("bake.insertion")
     addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     count = len(bpy.data.images)
@@ -286,7 +286,7 @@ def test_plate_and_source_leave_the_group_as_they_are_in_the_file(addon, scene, 
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
-def test_the_splats_alone_can_be_had(addon, scene, detailed, tmp_path, share):
+def test_splat_layer_can_be_mixed_in(addon, scene, detailed, tmp_path, share):
     addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node_of(addon, scene).inputs["Splat"].default_value = share
     frame, splat = (
@@ -296,7 +296,7 @@ def test_the_splats_alone_can_be_had(addon, scene, detailed, tmp_path, share):
     assert relative(render(scene, tmp_path)[..., :3], frame + share * (splat - frame)) < 1e-3
 
 
-def test_a_take_of_splats_alone_says_that_it_cannot_tell(addon, scene, shot, layers, tmp_path):
+def test_take_of_splats_only_reports_missing_layers(addon, scene, shot, layers, tmp_path):
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     node = node_of(addon, scene)
     node.inputs["Show What Is Invented"].default_value = 1.0
@@ -305,7 +305,7 @@ def test_a_take_of_splats_alone_says_that_it_cannot_tell(addon, scene, shot, lay
     assert np.abs(render(scene, tmp_path, size=(16, 12)) - layers(6)["rgba"])[..., :3].max() < 1e-6
 
 
-def test_a_group_of_an_older_file_gets_the_new_sockets_and_keeps_its_own(addon, scene, detailed, graded, tmp_path):
+def test_group_of_an_older_file_gains_new_sockets_and_keeps_existing_ones(addon, scene, detailed, graded, tmp_path):
     """A group of version 0.5 lacks the sockets; the artist's links and values are kept."""
     compat = addon("compat")
     addon("bake.insertion").insert_freeze(scene, detailed, "freeze")

@@ -148,7 +148,7 @@ def test_two_shots_take_turns(scene, shot, lit, addon, contract, tmp_path):
     assert scene.world == mine
 
 
-def test_undo_takes_it_away_and_redo_brings_it_back(scene, shot, lit, addon):
+def test_undo_removes_it_and_redo_restores_it(scene, shot, lit, addon):
     lights, mine = addon("freeze.lights"), scene.world.name
     bpy.ops.ed.undo_push(message="before")
     add(addon, scene, shot)
@@ -174,7 +174,7 @@ def test_it_is_saved_with_the_file(scene, shot, lit, addon, tmp_path):
     assert scene.world is not None and not scene.world.name.endswith("light")
 
 
-def test_the_timer_brings_in_what_a_job_made_in_its_scene_alone(scene, shot, lit, addon):
+def test_timer_inserts_a_job_result_only_into_its_scene(scene, shot, lit, addon):
     job = addon("process.jobs").Job(shot / "jobs" / "x", "light", {})
     job.result = {"take": "freeze", "key": KEY}
     step = addon("process.steps").STEPS["freeze"]
@@ -199,7 +199,7 @@ def test_what_cannot_be_added_is_a_sentence(scene, shot, lit, addon, contract):
     assert scene.world == world and len(bpy.data.worlds) == 1
 
 
-def test_the_button_has_it_made_at_the_cursor(scene, addon, contract, frozen_world):
+def test_button_requests_the_light_at_the_cursor(scene, addon, contract, frozen_world):
     shot = frozen_world / "tiny.splannequin"
     scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), "freeze"
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}

@@ -47,7 +47,7 @@ def _answer(session, request):
     session._take_in({"kind": "frame", "seq": request.seq, "t_star": 6, **size}, pixels)
 
 
-def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, contract, shot, monkeypatch):
+def test_resting_view_is_requested_sharper_then_with_plate_detail(addon, contract, shot, monkeypatch):
     """Only one request is open at a time, none while the view changes. Switching detail on or off takes effect at
     once."""
     viewport, live = addon("freeze.viewport"), addon("freeze.live")
@@ -95,7 +95,7 @@ def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, cont
     assert look(t_star=8.0) is None and session.open, "not asked for over and over"
 
 
-def test_switching_developing_is_asked_for_like_another_view(addon, contract):
+def test_switching_develop_sends_a_new_request(addon, contract):
     views = [contract.LiveView(1, 0, VIEWMAT, [9.0, 9.0, 8.0, 6.0], 16, 12, 6.0, develop=on) for on in (True, False)]
     same = addon("freeze.viewport")._same
     assert same(views[0], views[0]) and not same(*views)
@@ -132,7 +132,7 @@ def test_what_the_backend_warned_of_is_shown_while_it_draws(addon, shot, monkeyp
     assert viewport.note() == "Scrubbing uses the processor."
 
 
-def test_an_orthographic_view_is_not_asked_for(addon, shot, scene):
+def test_orthographic_view_sends_no_request(addon, shot, scene):
     scene.splannequin.shot_path = str(shot)
     assert addon("freeze.viewport").view_of(scene, shot, (64, 48), (Matrix(), Matrix()), 6.0, 10**9) is None
 

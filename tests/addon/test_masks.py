@@ -26,7 +26,7 @@ def drawn():
     return mask
 
 
-def test_the_solve_is_asked_for_the_masks_that_are_chosen(addon, contract, scene, shot, tmp_path):
+def test_chosen_masks_reach_the_solve_request(addon, contract, scene, shot, tmp_path):
     props, step = scene.splannequin, addon("process.steps").STEPS["solve"]
     props.shot_path = str(shot)
     props.ignore_from, props.people_from = "FILE", "ALPHA"
@@ -42,7 +42,7 @@ def test_the_solve_is_asked_for_the_masks_that_are_chosen(addon, contract, scene
         step.params(scene)
 
 
-def test_a_focal_length_is_asked_for_as_it_was_typed(addon, contract, scene):
+def test_typed_focal_length_reaches_the_request_unchanged(addon, contract, scene):
     props, step = scene.splannequin, addon("process.steps").STEPS["solve"]
     props.sensor_mm, props.refine_focal = 23.6, False
     assert step.params(scene) == contract.SolveParams(), "without a focal length they say nothing"
@@ -82,7 +82,7 @@ def test_a_drawn_masks_values_are_those_of_its_picture(addon, shot, drawn, share
     assert np.allclose(inside, share, atol=0.01) and (found[:, width // 2 :] == 0.0).all()
 
 
-def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_as_it_was(addon, shot, drawn):
+def test_mask_renders_one_frame_per_tick_and_cancel_restores_the_scene(addon, shot, drawn):
     into = shot / "masks" / "people"
     into.mkdir(parents=True)
     (into / "000005.png").write_bytes(b"of before")
@@ -201,7 +201,7 @@ def test_a_mask_follows_its_clip_wherever_the_project_lies(addon, scene, shot, t
     assert addon("solve.drawn_masks")._shift(addon("solve.drawn_masks").contract.ShotFolder(shot)) == -1000
 
 
-def test_a_mask_follows_its_clip_in_a_shot_that_counts_from_a_start_of_its_own(addon, shot, tmp_path, pictures):
+def test_mask_follows_its_clip_in_a_shot_with_a_start_frame(addon, shot, tmp_path, pictures):
     """File 0005 is frame 1005 of the shot. A clip that starts there shows it at scene frame 1."""
     for number in (5, 6):
         pictures.write(tmp_path / f"take.{number:04d}.png", np.zeros((12, 16, 3), np.uint8))

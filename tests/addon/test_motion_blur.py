@@ -69,7 +69,7 @@ def wall(scene):
     return camera
 
 
-def test_the_mean_over_the_shutter_is_cycles_own_motion_blur(scene, wall, root, tmp_path):
+def test_mean_over_the_shutter_matches_cycles_motion_blur(scene, wall, root, tmp_path):
     python = os.environ.get("SPLANNEQUIN_BACKEND_PYTHON")
     if not python:
         pytest.skip("no backend to ask: SPLANNEQUIN_BACKEND_PYTHON names its Python")

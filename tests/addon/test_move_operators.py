@@ -46,7 +46,7 @@ def path_read(addon, scene, shot):
             return end.value
 
 
-def test_smooth_at_0_is_the_clips_own_path(addon, contract, scene, shaky):
+def test_zero_smoothing_keeps_the_clip_path(addon, contract, scene, shaky):
     assert bpy.ops.splannequin.move_smooth(position=0.0, rotation=0.0) == {"FINISHED"}
     camera = scene.splannequin.path_camera
     assert camera.name.endswith(" smooth") and camera.parent == addon("solve.cameras").find(scene, shaky, "EMPTY")
@@ -135,7 +135,7 @@ def test_orbit_leaves_the_path_around_the_middle_and_comes_back(addon, scene, sh
         assert moved[2] == pytest.approx(0.0, abs=1e-4), "it swings around the scene's upward axis"
 
 
-def test_the_takes_depth_is_asked_first_and_then_the_points(addon, scene, shaky):
+def test_middle_depth_comes_from_the_take_before_the_points(addon, scene, shaky):
     operators = addon("freeze.move_operators")
     path = operators.clip_path(shaky)
     z = addon("freeze.middle_depth").of_frame(shaky / "takes" / "freeze" / "000006.exr")
@@ -187,6 +187,6 @@ def test_two_shots_each_keep_their_move(addon, scene, shaky, tmp_path):
     assert scene.splannequin.path_camera == second
 
 
-def test_without_the_solve_in_the_scene_there_is_no_move(scene, shot):
+def test_move_needs_the_solve_in_the_scene(scene, shot):
     scene.splannequin.shot_path = str(shot)
     assert not bpy.ops.splannequin.move_smooth.poll()

@@ -121,7 +121,7 @@ def test_colour_spaces_are_known_by_what_they_do(root, shot, tmp_path):
     assert "said" in result["first"] and "said" in result["freeze"]
 
 
-def test_where_nothing_fits_a_sentence_says_so_and_the_scene_stays_as_it_was(root, shot, tmp_path):
+def test_unmatched_colour_space_is_reported_and_changes_nothing(root, shot, tmp_path):
     text = CONFIG.format(paint="ACEScg", view="Film", display="REC.1886-REC.709")
     (tmp_path / "config.ocio").write_text(text)
     result = blender(tmp_path / "config.ocio", root, shot, tmp_path)

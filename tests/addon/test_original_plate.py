@@ -108,7 +108,7 @@ def test_the_freeze_as_a_warp_works_on_the_footage_itself(addon, scene, footage,
     assert float((np.abs(found - delivered) / np.maximum(np.abs(delivered), 0.01)).max()) < 1e-3
 
 
-def test_its_lens_is_taken_away_by_the_takes_map(addon, scene, footage, tmp_path):
+def test_take_map_undistorts_the_plate(addon, scene, footage, tmp_path):
     shot = footage(map="stmap/undistort.exr")
     st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", make_detail.places(6))
     said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
@@ -118,7 +118,7 @@ def test_its_lens_is_taken_away_by_the_takes_map(addon, scene, footage, tmp_path
     assert float((np.abs(found - expected) / np.maximum(np.abs(expected), 0.05)).max()) < 2e-3
 
 
-def test_bakes_replace_each_other_and_leave_nothing(addon, scene, footage):
+def test_new_bake_replaces_the_old_without_leftovers(addon, scene, footage):
     shot = footage(map="stmap/undistort.exr")
     kinds = ("images", "node_groups", "textures")
     before = {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds}
@@ -138,7 +138,7 @@ def test_bakes_replace_each_other_and_leave_nothing(addon, scene, footage):
     assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == before
 
 
-def test_what_is_read_ahead_is_the_footage(addon, scene, footage):
+def test_prefetch_reads_the_footage(addon, scene, footage):
     bake, shot = addon("bake.insertion"), footage()
     assert len(list(bake.read_ahead(scene, shot, "detail"))) == 2
     bake.insert(scene, shot, "detail")
@@ -146,7 +146,7 @@ def test_what_is_read_ahead_is_the_footage(addon, scene, footage):
     assert [i.name for i in bpy.data.images if i.name.startswith("Plate")] == ["Plate 000005"]
 
 
-def test_the_map_of_the_lens_is_read_ahead_and_again_if_it_has_changed(addon, scene, footage, tmp_path):
+def test_lens_map_is_prefetched_and_reread_after_a_change(addon, scene, footage, tmp_path):
     """Reading a map blocks Blender's window, so each map has its own turn. The first bake here is never inserted."""
     bake, shot = addon("bake.insertion"), footage(map="stmap/undistort.exr")
     for frame in (5, 6):
@@ -177,9 +177,7 @@ def test_a_video_shows_frame_n_at_frame_n(addon, scene, footage, tmp_path):
 
 
 @pytest.mark.parametrize("code, rows", [(3, (-1, 0, 0, 0, -1, 0)), (6, (0, 1, 0, -1, 0, 0)), (8, (0, -1, 0, 1, 0, 0))])
-def test_a_turned_video_is_the_plate_where_blender_turns_it_and_working_frames_elsewhere(
-    addon, scene, footage, tmp_path, code, rows
-):
+def test_rotated_video_is_used_where_blender_rotates_it(addon, scene, footage, tmp_path, code, rows):
     data = bytearray((DATA / "levels.mp4").read_bytes())
     at = data.find(b"tkhd") + 44
     data[at : at + 24] = np.array([65536 * value for value in rows], ">i4").tobytes()
@@ -211,7 +209,7 @@ def test_a_turned_video_is_the_plate_where_blender_turns_it_and_working_frames_e
         ({"map": "stmap/undistort.exr"}, "the take's ST map is gone"),
     ],
 )
-def test_working_frames_stand_in_and_a_sentence_says_why(addon, scene, footage, changes, why):
+def test_working_frames_replace_unusable_footage_with_a_reason(addon, scene, footage, changes, why):
     said = addon("bake.insertion").insert_freeze(scene, footage(**changes), "detail")
     assert f"The compositor shows working frames as the plate, not the footage: {why}." in said
     shown = [image for image in bpy.data.images if image.name.startswith("Plate")]
@@ -276,7 +274,7 @@ def test_frames_and_warps_of_acescg_footage_are_read_in_their_light(addon, scene
         bake.insert_freeze(scene, shot, "detail", warp=warp)
 
 
-def test_working_frames_that_stand_in_have_the_highlights_of_their_shoulder(addon, contract, scene, footage, tmp_path):
+def test_working_frames_restore_highlights_from_their_shoulder(addon, contract, scene, footage, tmp_path):
     """Light up to 60 is recovered by the compositor. If the record has no shoulder, the frames are read as sRGB."""
     shot = footage(unlike="its pixels are not square")
     light = shoulder.light(*SIZE)

@@ -221,7 +221,7 @@ def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_s
     assert bpy.ops.splannequin.write_stmaps.poll()
 
 
-def test_without_a_solve_the_button_is_off(addon, scene, tmp_path):
+def test_overscan_button_is_disabled_without_a_solve(addon, scene, tmp_path):
     scene.splannequin.shot_path = str(tmp_path / "none.splannequin")
     assert not bpy.ops.splannequin.write_stmaps.poll()
 

@@ -60,7 +60,7 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
 
 
 @pytest.mark.parametrize("name", ["ignore_path", "people_path", "st_map", "cameras_path"])
-def test_what_a_solve_is_given_is_found_again_in_a_project_that_is_moved(addon, project, name):
+def test_solve_inputs_are_found_in_a_moved_project(addon, project, name):
     (project / "given.exr").touch()
     setattr(bpy.context.scene.splannequin, name, str(project / "given.exr"))
     blend(project)
@@ -69,7 +69,7 @@ def test_what_a_solve_is_given_is_found_again_in_a_project_that_is_moved(addon, 
     assert addon("scene.paths").absolute(getattr(settings, name)) == str(destination / "given.exr")
 
 
-def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
+def test_copied_project_uses_the_copied_files(addon, project):
     blend(project)
     copy = Path(shutil.copytree(project, project.with_name("copy")))
     scene = opened(copy)
@@ -78,7 +78,7 @@ def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
 
 
 @pytest.mark.skipif(os.sep != "/", reason="there a backslash is what it is")
-def test_a_file_that_was_saved_on_windows_finds_its_shot_elsewhere(addon, project):
+def test_file_saved_on_windows_finds_its_shot_on_other_systems(addon, project):
     """On Windows, Blender writes backslashes into relative paths."""
     (project / "scenes").mkdir()
     odd = project / "scenes" / "a\\b.exr"
@@ -97,7 +97,7 @@ def test_a_file_that_was_saved_on_windows_finds_its_shot_elsewhere(addon, projec
     assert addon("scene.paths").absolute(scene.splannequin.st_map) == str(odd), "a name of Linux's own"
 
 
-def test_an_older_file_that_holds_whole_paths_is_found_beside(addon, project):
+def test_older_file_with_absolute_paths_finds_its_neighbours(addon, project):
     bpy.context.preferences.filepaths.use_relative_paths = False
     try:
         blend(project)
@@ -109,7 +109,7 @@ def test_an_older_file_that_holds_whole_paths_is_found_beside(addon, project):
     assert addon("shot.selection").shot_folder(scene) == destination / "people.splannequin"
 
 
-def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_path):
+def test_save_as_and_save_copy_keep_the_shot(addon, project, tmp_path):
     blend(project)
     (tmp_path / "other").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "copy.blend"), copy=True)
@@ -139,7 +139,7 @@ def painted_on(shot: Path):
     return image
 
 
-def test_saving_elsewhere_keeps_where_a_bake_goes_and_what_is_painted(addon, project, tmp_path):
+def test_save_as_keeps_bake_output_and_paint(addon, project, tmp_path):
     shot, mattes = project / "people.splannequin", addon("solve.mattes")
     image = painted_on(shot)
     addon("bake.rendering").choose_output(bpy.context.scene, shot, "freeze")
@@ -167,7 +167,7 @@ def test_an_output_path_of_the_artists_is_left_as_it_is(project, tmp_path, artis
     assert bpy.context.scene.render.filepath == artists_path
 
 
-def test_an_older_file_that_holds_a_whole_output_path_bakes_beside_itself(addon, project):
+def test_older_file_with_absolute_output_bakes_next_to_itself(addon, project):
     bpy.context.preferences.filepaths.use_relative_paths = False
     try:
         addon("bake.rendering").choose_output(bpy.context.scene, project / "people.splannequin", "freeze")
@@ -219,7 +219,7 @@ def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     assert not addon("shot.selection").missing(scene, addon("shot.inventory").read(destination))
 
 
-def test_a_shot_that_is_yet_to_be_made_is_not_missed(addon, scene, tmp_path):
+def test_shot_before_its_first_import_is_not_reported_missing(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "new.mp4")
     folder = addon("shot.selection").shot_folder(scene)
     assert not addon("shot.selection").missing(scene, addon("shot.inventory").read(folder))
@@ -233,7 +233,7 @@ def test_the_timer_remembers_a_shot_that_was_chosen(addon, scene, shot):
     assert addon("shot.selection").missing(scene, addon("shot.inventory").read(shot))
 
 
-def test_the_footage_of_a_moved_shot_is_found_beside_it(addon, scene, shot, clip, tmp_path):
+def test_moved_shot_finds_footage_next_to_it(addon, scene, shot, clip, tmp_path):
     info = json.loads((shot / "shot.json").read_text())
     (shot / "shot.json").write_text(json.dumps(info | {"source": "/nowhere/footage/people.mp4"}))
     places, shots = addon("shot.places"), addon("shot.inventory")
@@ -262,7 +262,7 @@ def test_a_failed_import_leaves_no_empty_shot(addon, scene, tmp_path):
     assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
 
 
-def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, scene, tmp_path):
+def test_failed_import_leaves_no_shot_and_is_reported(addon, scene, tmp_path):
     wrong = tmp_path / "text.mp4"
     wrong.write_text("no video")
     scene.splannequin.clip = str(wrong)
@@ -277,7 +277,7 @@ def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, sc
     assert watch.jobs["import"].state == "failed" and "text.mp4" in watch.jobs["import"].status.message
 
 
-def test_a_failed_import_is_taken_away_once_its_process_has_ended(addon, contract, tmp_path):
+def test_failed_import_is_removed_after_its_process_ended(addon, contract, tmp_path):
     """The process reports its end before it releases the shot's lock and, on Windows, its log."""
     supervisor, jobs, shot = addon("process.job_timer"), addon("process.jobs"), tmp_path / "text.splannequin"
     addon("shot.inventory").create(shot)

@@ -126,7 +126,7 @@ def test_a_lens_comes_between_and_goes_with_the_artists_links(bake, footage):
     assert not [g for g in bpy.data.node_groups if "Undistort" in g.name]
 
 
-def test_a_node_of_the_artists_between_plate_and_lens_stays_there(bake, footage):
+def test_artist_node_between_plate_and_lens_is_kept(bake, footage):
     footage(lens=True)
     tree, group = bake("detail")
     lens, blur = named(tree, "Undistort Plate"), tree.nodes.new("CompositorNodeBlur")
@@ -139,7 +139,7 @@ def test_a_node_of_the_artists_between_plate_and_lens_stays_there(bake, footage)
     assert path_into(group.inputs["Image"]) == ["Fit Plate", blur.name, "Plate"]
 
 
-def test_what_the_artist_leads_in_instead_is_left_alone(bake, footage):
+def test_artist_link_into_the_group_is_kept(bake, footage):
     tree, group = bake()
     colour = tree.nodes.new("CompositorNodeRGB")
     tree.links.new(colour.outputs[0], group.inputs["Image"])
@@ -193,9 +193,7 @@ def test_how_the_plate_is_fitted_follows_its_shape_and_else_stays_as_set(addon, 
     assert how(fit).upper() == "FIT"
 
 
-def test_a_stream_that_was_brought_to_another_plate_renders_as_one_made_anew(
-    addon, bake, footage, scene, tmp_path, pictures
-):
+def test_stream_moved_to_another_plate_renders_like_a_new_one(addon, bake, footage, scene, tmp_path, pictures):
     def render(name: str) -> np.ndarray:
         _, group = bake("detail")
         group.inputs["Mix"].default_value = 0.0

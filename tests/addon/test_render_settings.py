@@ -191,7 +191,7 @@ def test_an_output_path_that_means_nothing_is_refused_in_words(baked, tmp_path):
     assert baked.render.filepath == str(tmp_path / "{nothing}" / "f")
 
 
-def test_the_artists_own_templates_are_filled_in(baked, tmp_path):
+def test_output_path_templates_are_filled_in(baked, tmp_path):
     baked.render.filepath = str(tmp_path / "out" / "f_##")
     if bpy.app.version >= (5, 0, 0):
         baked.render.filepath = str(tmp_path / "{scene_name}" / "f_##")

@@ -4,7 +4,7 @@ import bpy
 import pytest
 
 
-def test_a_change_that_fails_takes_back_what_it_made_and_set(addon, scene):
+def test_failed_change_is_rolled_back(addon, scene):
     scene.render.resolution_x, scene.frame_end = 640, 40
     camera, objects = scene.camera, set(bpy.data.objects)
     with pytest.raises(OSError, match="gone"), addon("scene.rollback").scene_of(scene):

@@ -80,7 +80,7 @@ def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, sh
     assert (params.run, params.preset, params.seed, params.iterations, params.extend) == ("main", "final", 9, 900, 0)
 
 
-def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
+def test_train_request_matches_its_button_label(addon, with_runs, shot):
     props, steps = with_runs.splannequin, addon("process.steps").STEPS
     props.extend_steps = 70
     params = steps["train"].params(with_runs)
@@ -106,7 +106,7 @@ def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
     assert steps["train"].params(with_runs).extend == 0
 
 
-def test_depth_maps_are_asked_for_and_other_ones_train_anew(addon, with_runs, shot, tmp_path):
+def test_new_depth_maps_restart_training(addon, with_runs, shot, tmp_path):
     props, step = with_runs.splannequin, addon("process.steps").STEPS["train"]
     props.run_name, props.depth = "new", f"{tmp_path / 'depth'}{os.sep}"
     params = step.params(with_runs)
@@ -183,7 +183,7 @@ def test_broken_checkpoints_are_passed_over(addon, shot, tmp_path):
     assert addon("shot.inventory").read(shot).unfinished == {}
 
 
-def test_runs_and_takes_stand_side_by_side(addon, with_runs, shot, new_take):
+def test_runs_and_takes_are_listed_together(addon, with_runs, shot, new_take):
     new_take(shot, "second")
     state, listing = addon("shot.inventory").read(shot), addon("ui.listing")
     assert listing.run_rows(state) == [
@@ -250,7 +250,7 @@ def test_new_buttons_have_tooltips(addon):
         assert all(p.identifier == "rna_type" or p.description for p in kind.properties), cls
 
 
-def test_the_curve_of_an_added_stretch_follows_the_runs_own(addon):
+def test_extension_curve_continues_the_run_curve(addon):
     record = {"history": [(1.0, 20.0), (2.0, 21.0), (3.0, 22.0)]}
     history = addon("train.training").history
     assert history(record, []) == record["history"]

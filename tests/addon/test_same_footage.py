@@ -93,7 +93,7 @@ def test_a_video_is_known_by_its_file(addon, video, tmp_path, monkeypatch, kind)
     assert not shows(image(path, "MOVIE"), [tmp_path / "gone.mov"])
 
 
-def test_a_movie_clip_and_an_image_are_told_alike_and_a_still_is_no_sequence(addon, plate):
+def test_clip_and_image_of_one_footage_match_and_a_still_does_not(addon, plate):
     shows = addon("scene.same_footage").shows
     clip = bpy.data.movieclips.load(str(plate.with_name("plate.v002.0006.png")))
     assert clip.source == "SEQUENCE" and shows(clip, [plate])

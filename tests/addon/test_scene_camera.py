@@ -111,7 +111,7 @@ def test_the_timer_reads_it_in_turns_and_the_solve_begins(addon, chosen, shot):
     watch.jobs["solve"].process.wait()
 
 
-def test_a_camera_that_is_given_up_leaves_the_frame_and_the_shot(addon, chosen, shot):
+def test_cancelled_camera_restores_frame_and_shot(addon, chosen, shot):
     turns = addon("solve.scene_camera").write_in_turns(chosen, "match é", shot)
     chosen.frame_set(3)
     assert next(turns) == (1, 3) and chosen.frame_current == 5
@@ -167,7 +167,7 @@ def in_scene_world(shot):
     return shot
 
 
-def test_the_solve_stands_where_the_camera_stands(addon, contract, scene, in_scene_world):
+def test_solve_is_placed_at_the_scene_camera(addon, contract, scene, in_scene_world):
     shot = in_scene_world
     scene.splannequin.shot_path = str(shot)
     said = addon("solve.arrival").load_camera(scene, shot)

@@ -139,7 +139,7 @@ def test_two_shots_of_one_name_are_two(addon, built, shot, tmp_path):
     assert cameras.find(built, shot, "CAMERA") is None and len(built.splannequin.made) == 1
 
 
-def test_the_camera_that_was_there_before_comes_back(addon, built, shot):
+def test_previous_scene_camera_is_restored(addon, built, shot):
     cameras, first_camera = addon("solve.cameras"), bpy.data.objects["Camera"]
     assert built.camera == cameras.find(built, shot, "CAMERA")
     first_camera.name = "renamed since"

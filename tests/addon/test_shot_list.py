@@ -28,7 +28,7 @@ def two(addon, scene, shot, second_shot):
     return scene
 
 
-def test_settings_are_put_away_and_come_back(addon, scene, shot, second_shot, clip):
+def test_settings_are_stored_and_restored_per_shot(addon, scene, shot, second_shot, clip):
     props, shot_list = scene.splannequin, addon("shot.selection")
     assert not bpy.ops.splannequin.shot_add.poll(), "there is no first shot yet"
     props.shot_path, props.clip = str(shot), "//first.mov"
@@ -126,7 +126,7 @@ def seen(scene) -> tuple:
     return size, round(render.fps / render.fps_base, 3), (scene.frame_start, scene.frame_end)
 
 
-def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, second_shot):
+def test_size_rate_and_range_are_stored_per_shot(addon, scene, shot, second_shot):
     """Switching restores the values that the artist left; removing the last shot restores the scene's own values."""
     first, second = ((16, 12, 100), 12.5, (5, 7)), ((32, 24, 100), 25.0, (5, 7))
     original = seen(scene)
@@ -167,7 +167,7 @@ def test_what_the_artist_set_for_a_shot_is_still_the_artists_after_switching(add
     assert two.render.resolution_x == 4000 and two.frame_end == 250
 
 
-def test_a_scene_that_was_left_alone_stays_so_at_switching(addon, scene, shot, second_shot):
+def test_switching_shots_keeps_scene_settings_untouched(addon, scene, shot, second_shot):
     scene.render.resolution_x, scene.frame_end = 640, 99
     props = scene.splannequin
     props.shot_path = str(shot)
@@ -185,7 +185,7 @@ def datablocks(scene) -> set[str]:
     return {item.name for kind in kinds for item in kind}
 
 
-def test_removing_one_shot_leaves_the_other(addon, scene, shot, second_shot):
+def test_removing_one_shot_keeps_the_second(addon, scene, shot, second_shot):
     props = scene.splannequin
     props.shot_path = str(shot)
     addon("solve.arrival").load_camera(scene, shot)
@@ -302,7 +302,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
     assert props.shots[1].t_star == 7
 
 
-def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, second_shot):
+def test_camera_file_of_one_shot_does_not_freeze_another(addon, contract, two, shot, second_shot):
     supervisor = addon("process.job_timer")
     read = addon("freeze.takes").reading(two.session_uid, second_shot, "freeze", iter_path(contract), 1)
     supervisor.work(second_shot, "freeze", read)
@@ -318,7 +318,7 @@ def iter_path(contract):
     return contract.CameraPath(8, 8, [])
 
 
-def test_a_dropped_video_begins_a_shot_beside_one_that_was_imported(addon, scene, shot, clip):
+def test_dropped_video_starts_a_second_shot(addon, scene, shot, clip):
     props = scene.splannequin
     props.shot_path = str(shot)
     bpy.ops.splannequin.use_clip(filepath=str(clip))
@@ -347,7 +347,7 @@ def linked(addon, scene, shot, tmp_path):
     return found
 
 
-def test_a_linked_scene_with_the_same_shot_is_left_alone(addon, linked, shot):
+def test_linked_scene_with_the_same_shot_is_not_changed(addon, linked, shot):
     selection, supervisor = addon("shot.selection"), addon("process.job_timer")
     comp_scene = bpy.data.scenes["Comp"]
     assert selection.shot_folder(linked) == shot, "it is the same one"
@@ -385,7 +385,7 @@ def test_a_video_dropped_again_is_the_shot_that_it_was(addon, scene, shot, tmp_p
     assert len(props.shots) == 2 and props.active_shot == 0 and props.clip == f"//{clip.name}"
 
 
-def test_what_two_entries_share_stays_with_the_other(addon, two, shot):
+def test_data_shared_by_two_entries_survives_removal_of_one(addon, two, shot):
     props, cameras = two.splannequin, addon("solve.cameras")
     props.shot_path = str(shot)
     assert addon("shot.selection").folders(two) == [shot, shot]

@@ -85,7 +85,7 @@ def test_what_blender_tracked_comes_out_as_it_was_filmed(addon, tracked):
     assert [transforms[n] for n in ("k1", "k2", "k3")] == pytest.approx([K1, 0.0, 0.0])
 
 
-def test_the_solve_is_asked_for_with_what_was_tracked(addon, tracked, scene, shot):
+def test_tracked_camera_reaches_the_solve_request(addon, tracked, scene, shot):
     listing = shot / "frames" / "frames.json"
     listing.write_text(json.dumps({**json.loads(listing.read_text()), "key": "imported"}))
     props = scene.splannequin
@@ -121,7 +121,7 @@ def test_pixels_that_are_not_square_have_two_focal_lengths(addon, clip):
 
 
 @pytest.mark.parametrize(("model", "name"), [("DIVISION", "division_k1"), ("NUKE", "nuke_k1"), ("BROWN", "brown_p1")])
-def test_other_lens_models_are_refused_unless_they_bend_nothing(addon, contract, clip, model, name):
+def test_unsupported_lens_models_are_refused_unless_undistorted(addon, contract, clip, model, name):
     clip.tracking.camera.distortion_model = model
     assert "k1" not in addon("solve.exchange").lens(clip)
     setattr(clip.tracking.camera, name, 0.01)
@@ -207,7 +207,7 @@ def test_an_export_in_a_window_is_followed_without_waiting(addon, contract, scen
     assert (str(tmp_path / "out") if well else "is not a shot folder") in said
 
 
-def test_export_and_given_cameras_from_the_command_line(addon, shot, tmp_path, capfd):
+def test_command_line_exports_and_imports_cameras(addon, shot, tmp_path, capfd):
     main = addon("command_line.headless").main
     assert main(["export", str(shot), "--format", "nerfstudio", "--output", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "transforms.json").is_file()

@@ -213,7 +213,7 @@ def test_what_cannot_be_added_is_said(scene, shot, stood, addon, contract):
     assert not [m for m in bpy.data.meshes if "splats" in m.name], "nothing half-made stays"
 
 
-def test_the_buttons_hand_on_where_the_shot_stands(scene, shot, stood, addon, tmp_path):
+def test_splat_buttons_pass_the_shot_placement(scene, shot, stood, addon, tmp_path):
     """Camera for Nuke, exported by the button: positions of Blender's camera, converted to y up."""
     out = tmp_path / "out"
     assert bpy.ops.splannequin.export_cameras(directory=str(out), format="chan") == {"FINISHED"}
@@ -225,7 +225,7 @@ def test_the_buttons_hand_on_where_the_shot_stands(scene, shot, stood, addon, tm
         assert np.radians(row[7]) == pytest.approx(2 * np.arctan(12 / 2 / 20.0), abs=1e-6)
 
 
-def test_blenders_own_importer_reads_a_ply_that_lies_on_the_camera(scene, shot, stood, addon, contract):
+def test_blender_importer_aligns_a_ply_with_the_camera(scene, shot, stood, addon, contract):
     """frozen.ply is in the scene's axes and units, so no rotation is needed."""
     placed_take(shot, addon, scene)
     known = set(bpy.data.objects)
@@ -301,9 +301,7 @@ def test_where_blenders_importer_reads_splats_it_is_used(scene, shot, stood, add
 
 
 @pytest.mark.parametrize("metres", [1.0, 0.01])
-def test_blenders_own_importer_brings_the_camera_back_to_where_it_is(
-    scene, shot, stood, addon, contract, root, tmp_path, metres
-):
+def test_blender_importer_restores_the_camera_pose(scene, shot, stood, addon, contract, root, tmp_path, metres):
     """Blender reads the backend's USD stage with the same pose, lens and offsets on every frame."""
     if not addon("compat").usd_import_options():
         pytest.skip("this Blender reads no USD")

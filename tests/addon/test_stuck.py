@@ -100,13 +100,13 @@ def test_the_rate_of_a_sequence_is_the_one_that_was_set(addon, scene, tmp_path, 
     assert addon("shot.inventory").read(addon("shot.selection").shot_folder(scene)).info["fps"] == 30.0
 
 
-def test_the_colour_space_that_was_named_is_asked_for(addon, scene, tmp_path):
+def test_named_colour_space_reaches_the_request(addon, scene, tmp_path):
     scene.splannequin.clip, scene.splannequin.colour_space = str(tmp_path / "a.mp4"), " ARRI LogC3 (EI800) "
     params = addon("process.steps").STEPS["import"].params(scene)
     assert params.colour_space == "ARRI LogC3 (EI800)"
 
 
-def test_what_a_person_says_of_the_footage_is_asked_for(addon, scene, tmp_path):
+def test_manual_footage_settings_reach_the_request(addon, scene, tmp_path):
     props = scene.splannequin
     props.clip = str(tmp_path / "a.mp4")
     plain = addon("process.steps").STEPS["import"].params(scene)
@@ -184,7 +184,7 @@ def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
     monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
 
 
-def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp_path):
+def test_interrupted_environment_is_not_accepted(addon, contract, monkeypatch, tmp_path):
     """Set-up was cancelled, or Blender was closed during it: the interpreter exists, the packages do not."""
     backend = addon("process.backend")
     monkeypatch.delenv("SPLANNEQUIN_BACKEND_PYTHON", raising=False)

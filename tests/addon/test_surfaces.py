@@ -55,7 +55,7 @@ def corners(item):
     return np.array([item.matrix_world @ v.co for v in item.data.vertices])
 
 
-def test_it_stands_where_it_left_for_and_follows_the_root(scene, shot, stood, addon):
+def test_surface_keeps_its_place_and_follows_the_root(scene, shot, stood, addon):
     assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
     room, people = found(addon, scene, shot)
     np.testing.assert_allclose(corners(room), FLOOR, atol=1e-5)
@@ -68,7 +68,7 @@ def test_it_stands_where_it_left_for_and_follows_the_root(scene, shot, stood, ad
     np.testing.assert_allclose(corners(room), FLOOR + np.array([1, 0, 0]), atol=1e-5)
 
 
-def test_added_again_it_is_replaced_and_remove_shot_takes_it_away(scene, shot, stood, addon):
+def test_surface_is_replaced_on_reinsert_and_removed_with_the_shot(scene, shot, stood, addon):
     for _ in range(2):
         assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
     assert len(found(addon, scene, shot)) == 2 and len(bpy.data.meshes) <= 4
@@ -76,7 +76,7 @@ def test_added_again_it_is_replaced_and_remove_shot_takes_it_away(scene, shot, s
     assert not [o for o in bpy.data.objects if o.type == "MESH" and o.is_shadow_catcher]
 
 
-def test_the_timer_brings_in_what_a_job_made(scene, shot, stood, addon):
+def test_timer_inserts_a_finished_surface(scene, shot, stood, addon):
     timer, job = addon("process.job_timer"), addon("process.jobs").Job(shot / "jobs" / "x", "surface", {})
     job.result = {"take": "freeze"}
     assert addon("process.steps").STEPS["freeze"].arrive(scene, job)
@@ -88,7 +88,7 @@ def test_the_timer_brings_in_what_a_job_made(scene, shot, stood, addon):
     assert timer.watch_of(shot).notes["freeze"] and not timer.watch_of(shot).failures
 
 
-def test_undo_takes_it_away_and_redo_brings_it_back(scene, shot, stood, addon):
+def test_undo_removes_it_and_redo_restores_it(scene, shot, stood, addon):
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
     bpy.ops.ed.undo_push(message="added")
@@ -106,7 +106,7 @@ def test_what_the_artist_deletes_is_let_go(scene, shot, stood, addon):
     assert len(addon("shot.scene_objects").of(scene, shot).surfaces) == 1
 
 
-def test_two_shots_of_a_file_have_their_own(scene, shot, stood, addon, contract, tmp_path):
+def test_two_shots_of_a_file_have_separate_surfaces(scene, shot, stood, addon, contract, tmp_path):
     bpy.ops.splannequin.add_surface()
     second_shot = tmp_path / "other.splannequin"
     shutil.copytree(shot, second_shot)
@@ -160,7 +160,7 @@ def test_what_cannot_be_added_is_a_sentence(scene, shot, stood, addon, contract)
         addon("shot.scene_objects").check_root(scene, shot)
 
 
-def test_the_button_has_it_made_and_brings_it_in(scene, addon, frozen_world):
+def test_button_requests_and_inserts_the_surface(scene, addon, frozen_world):
     shot = frozen_world / "tiny.splannequin"
     scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), "freeze"
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}

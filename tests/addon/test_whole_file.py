@@ -105,7 +105,7 @@ def test_what_a_button_brought_in_is_undone_and_done_again(full, scene, addon, b
     assert counts() == after
 
 
-def test_two_shots_of_a_file_have_their_own_splats(full, scene, addon, contract, tmp_path):
+def test_two_shots_of_a_file_have_separate_splats(full, scene, addon, contract, tmp_path):
     assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
     second_shot = tmp_path / "other.splannequin"
     shutil.copytree(full, second_shot)
@@ -156,7 +156,7 @@ def test_the_node_of_a_matte_is_undone_and_done_again(full, scene, addon, contra
     assert matte_nodes(addon) == {("him", folder, 5)} and set(bpy.data.images.keys()) == after
 
 
-def test_two_shots_of_a_file_have_their_own_mattes(full, scene, addon, contract, tmp_path):
+def test_two_shots_of_a_file_have_separate_mattes(full, scene, addon, contract, tmp_path):
     """The mattes and the takes have equal names. A second insertion reuses the existing node."""
     second_shot = tmp_path / "other.splannequin"
     shutil.copytree(full, second_shot)

@@ -12,7 +12,7 @@ SOURCES_OF_UNSTORED_FIELDS = {
 """Map from the fields that no stored configuration holds to their source."""
 
 
-def test_every_number_of_a_training_is_asked_for_again(addon, contract):
+def test_resume_requests_every_stored_training_number(addon, contract):
     config = {
         "preset": "preview", "method": "auto", "iterations": 1, "width": 2, "holdout": 3, "seed": 4,
         "densify": {"budget": 5}, "supervision": {"preset": "support"},

@@ -30,7 +30,7 @@ def test_without_a_timed_run_nothing_is_promised(costs, addon, contract):
     assert basis is None and rows[-1].width == 0, "nothing is known of the clip"
 
 
-def test_a_preset_that_was_run_takes_as_long_again_and_others_by_pixels_and_steps(costs):
+def test_estimates_scale_a_timed_run_by_pixels_and_steps(costs):
     rows, basis = costs({"main": run(iterations=1000, train_seconds=100.0)})
     assert basis["run"] == "main"
     assert (rows["preview"].seconds, rows["preview"].measured) == (200.0, True)

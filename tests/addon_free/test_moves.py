@@ -69,7 +69,7 @@ def test_smooth_at_1_leaves_a_tenth_of_the_second_difference_and_follows_the_wal
     assert np.degrees(np.arccos(np.clip((np.trace(difference, axis1=1, axis2=2) - 1) / 2, -1, 1))).max() < 3.0
 
 
-def test_positions_and_rotations_are_smoothed_apart(moves):
+def test_positions_and_rotations_are_smoothed_independently(moves):
     poses = path(60, 0.02)
     moved, turned_ = moves.smoothed(poses, 1.0, 0.0), moves.smoothed(poses, 0.0, 1.0)
     np.testing.assert_allclose(moved[:, :3, :3], poses[:, :3, :3], atol=1e-12)
@@ -93,7 +93,7 @@ def test_a_quaternion_is_that_of_its_rotation_and_goes_the_short_way(moves):
     assert ((found[1:] * found[:-1]).sum(1) > 0).all()
 
 
-def test_a_stop_is_reached_held_and_left_without_a_kink(moves):
+def test_stops_have_smooth_starts_and_ends(moves):
     timing = moves.retimed(10, 90, 50, 20, 30, 12)
     assert timing.frames[0] == 10 and timing.frames[-1] == 90 and len(timing.frames) == 81 + 10 + 30 + 6
     pace = np.diff(timing.frames)

@@ -95,7 +95,7 @@ def test_wrong_input_is_one_sentence(tmp_path, capsys, arguments, code, word):
     assert "Traceback" not in text
 
 
-def test_hosts_are_known_by_their_files_alone(capsys):
+def test_hosts_are_discovered_from_their_files(capsys):
     from torch_backend.deformation import hosts
 
     assert HOSTS == host_names() == tuple(hosts())
@@ -125,7 +125,7 @@ def test_export_writes_and_refuses_in_words(world, tmp_path):
     assert refused.stderr.startswith("Error: ") and "holds another COLMAP model already" in refused.stderr
 
 
-def test_solve_refuses_cameras_that_are_not_there(world, tmp_path):
+def test_solve_refuses_missing_cameras(world, tmp_path):
     shot = tmp_path / "s.splannequin"
     shutil.copytree(world.shot.root, shot)
     listing = shot / "frames" / "frames.json"

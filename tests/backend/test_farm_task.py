@@ -142,7 +142,7 @@ def test_a_file_that_cannot_grow_is_said_without_a_traceback(submitted, tmp_path
     assert "openjd_fail: tiny, open a: " in done.stdout and "Traceback" not in done.stderr
 
 
-def test_a_host_without_blender_says_so(task, monkeypatch, submitted, tmp_path, capsys):
+def test_missing_blender_gives_a_readable_error(task, monkeypatch, submitted, tmp_path, capsys):
     from torch_backend.farm_task import BLENDER_VARIABLE
 
     monkeypatch.delenv(BLENDER_VARIABLE, raising=False)

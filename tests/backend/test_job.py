@@ -110,7 +110,7 @@ def test_what_a_user_can_put_right_is_a_value_error_to_whoever_tries(shot):
     assert isinstance(missing.value, JobError) and missing.value.exit_code == ExitCode.USAGE
 
 
-def test_a_name_that_is_no_text_is_told_as_well_as_may_be(shot, monkeypatch):
+def test_undecodable_name_is_printed_escaped(shot, monkeypatch):
     """File names on Linux are bytes: a clip from an old camera may have one in Latin-1."""
 
     def station(shot, params, report):
@@ -151,7 +151,7 @@ def test_a_package_that_the_environment_lacks_is_no_bug(shot, monkeypatch):
     assert "Press Repair" in status.hint and "a_package" in (folder / contract.LOG_FILE).read_text()
 
 
-def test_a_package_that_is_there_and_cannot_be_loaded_is_no_bug_either(shot, monkeypatch, tmp_path):
+def test_unloadable_package_is_not_reported_as_a_bug(shot, monkeypatch, tmp_path):
     """A system library is missing, or another package has the wrong version."""
     (tmp_path / "a_broken_package.py").write_text("raise ImportError('libx.so.1: cannot open shared object file')")
     monkeypatch.syspath_prepend(tmp_path)

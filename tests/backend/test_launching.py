@@ -56,7 +56,7 @@ def test_threads_and_numbers_are_those_of_each_call():
     assert out.tolist() == [19.0, 3.0, 2.0, 2.0, 2.0, 2.0] and second.tolist() == [8.0, 8.0, 8.0]
 
 
-def test_threads_of_python_launch_beside_each_other():
+def test_python_threads_launch_concurrently():
     outs = [torch.zeros(500) for _ in range(4)]
 
     def work(n):
@@ -72,7 +72,7 @@ def test_threads_of_python_launch_beside_each_other():
         assert (out[: 100 * (n + 1)] == 200.0 * (n + 1)).all() and not out[100 * (n + 1) :].any()
 
 
-def test_a_bare_structure_stands_for_a_warp_structure():
+def test_plain_structure_replaces_a_warp_structure():
     wp_struct = wp.struct(type("Both", (), {"__annotations__": {"out": wp.uint64, "value": wp.float32}}))
 
     def fill(args, tid): ...
@@ -274,7 +274,7 @@ def test_workers_may_have_workers():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows does not fork")
-def test_a_forked_child_has_workers_of_its_own():
+def test_forked_child_has_new_workers():
     counted(3, 1)
     child = os.fork()
     if child == 0:

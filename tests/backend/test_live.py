@@ -76,7 +76,7 @@ def ask(child, header):
     return read_message(child.stdout)
 
 
-def test_ready_tells_what_there_is_to_freeze(session, trained):
+def test_ready_message_lists_what_can_be_frozen(session, trained):
     _, summary = trained
     header = session[1]
     assert header["kind"] == "ready"
@@ -156,7 +156,7 @@ def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, traine
 
 
 @pytest.mark.parametrize("size", [(64, 48), (150, 60), (20, 30)])
-def test_a_view_of_any_size_is_made_of_plates(trained, size):
+def test_view_of_any_size_uses_plates(trained, size):
     world, _ = trained
     session = LiveSession(world.shot, "main", "cpu")
     width, height = size
@@ -171,7 +171,7 @@ def test_a_view_of_any_size_is_made_of_plates(trained, size):
     assert np.abs(plates - splats)[covered].max() > 1e-3
 
 
-def test_a_view_of_plates_gives_way_to_a_newer_one_and_is_made_after_it(session, trained):
+def test_plate_view_yields_to_a_newer_request_and_finishes_later(session, trained):
     world, _ = trained
     child, _ = session
     requests = [
@@ -195,7 +195,7 @@ def test_a_view_of_plates_gives_way_to_a_newer_one_and_is_made_after_it(session,
     assert came.index(5) < max(came.index(1), came.index(4))
 
 
-def test_what_is_being_made_of_plates_stops_between_two_plates(trained):
+def test_plate_view_is_interruptible_between_plates(trained):
     world, _ = trained
     session = LiveSession(world.shot, "main", "cpu")
     request = {k: v for k, v in view_of(world, 105, 112, exposed_like=105.0).items() if k != "kind"}
@@ -217,7 +217,7 @@ def test_what_is_being_made_of_plates_stops_between_two_plates(trained):
     assert waiting.next() is newer
 
 
-def test_without_its_footage_a_view_of_plates_says_so_and_splats_go_on(trained, tmp_path):
+def test_missing_footage_is_reported_and_splat_views_continue(trained, tmp_path):
     world, _ = trained
     shutil.copytree(world.shot.root, tmp_path / "torn.splannequin")
     child = start(tmp_path / "torn.splannequin")

@@ -56,7 +56,7 @@ def test_a_file_that_is_being_written_has_hardly_a_longer_path(tmp_path):
     assert len(names) == 100 and max(map(len, names)) <= len("checkpoint.safetensors") + 20
 
 
-def test_what_went_wrong_in_a_write_is_told_though_its_rest_cannot_be_removed(tmp_path):
+def test_write_error_is_reported_even_if_cleanup_fails(tmp_path):
     """On Windows, the writer of a picture may still have its file open."""
     with pytest.raises(Cancelled), atomic_path(tmp_path / "a.mp4") as partial:
         partial.mkdir()
@@ -114,7 +114,7 @@ def test_content_key_follows_files(tmp_path):
     assert content_key(path, {"a": 1}) != before
 
 
-def test_a_folder_behind_a_link_is_not_the_shots_own(tmp_path):
+def test_linked_folder_is_not_part_of_the_shot(tmp_path):
     shot = Shot.create(tmp_path / "a.splannequin")
     assert shot.own(shot.take("wide") / "preview") == shot.take("wide") / "preview"
     (tmp_path / "theirs").mkdir()

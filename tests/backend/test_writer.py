@@ -64,7 +64,7 @@ def put_lock(shot, writer: Writer) -> None:
     lock_of(shot).write_text(json.dumps(dataclasses.asdict(writer)))
 
 
-def test_a_job_begun_as_soon_as_the_one_before_told_its_end_waits_for_its_lock(shot):
+def test_job_started_right_after_another_waits_for_the_lock(shot):
     """The status is written before the lock is released, so a reader may start the next step in between."""
     folder = job.new_job(shot, "import", contract.ImportParams())
     now, pid = time.time(), os.getpid()
@@ -153,7 +153,7 @@ def test_another_computers_lock_is_never_taken_over(shot):
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[" * 5000, '{"host": 1}'])
-def test_a_lock_that_cannot_be_read_is_left_alone_and_named(shot, text, monkeypatch):
+def test_unreadable_lock_is_kept_and_named(shot, text, monkeypatch):
     monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
     lock_of(shot).write_text(text)
     with pytest.raises(JobError, match="cannot be told") as error, only_writer(shot.root, "import", "mine"):
@@ -173,7 +173,7 @@ def test_a_lock_that_is_a_link_is_not_written_through(shot, tmp_path, monkeypatc
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
-def test_a_lock_that_is_a_link_to_nowhere_is_named(shot, tmp_path, monkeypatch):
+def test_dangling_lock_link_is_named(shot, tmp_path, monkeypatch):
     monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
     lock_of(shot).symlink_to(tmp_path / "nowhere")
     with pytest.raises(JobError, match="cannot be made") as error, only_writer(shot.root, "import", "mine"):
@@ -181,7 +181,7 @@ def test_a_lock_that_is_a_link_to_nowhere_is_named(shot, tmp_path, monkeypatch):
     assert str(lock_of(shot)) in error.value.message and not (tmp_path / "nowhere").exists()
 
 
-def test_a_job_whose_shot_was_taken_over_ends_and_leaves_it_to_the_other(shot, monkeypatch):
+def test_job_ends_when_its_shot_was_taken_over(shot, monkeypatch):
     """The job was suspended, or lost its disk, for longer than the heartbeat timeout."""
     monkeypatch.setattr(contract, "HEARTBEAT_SECONDS", 0.02)
     new_owner = dataclasses.replace(dead_writer(), host=OTHER_COMPUTER)
@@ -277,7 +277,7 @@ def test_an_import_into_a_shot_that_goes_leaves_nothing_in_its_place(shot, tmp_p
     assert heard[-2].data["message"].startswith("The import ended: the shot folder") and not shot.root.exists()
 
 
-def test_folders_of_a_shot_that_is_worked_on_are_made_only_inside_it(tmp_path):
+def test_locked_shot_creates_folders_only_inside_it(tmp_path):
     root = tmp_path / "a"
     with working_on(root), pytest.raises(FileNotFoundError):
         make_folder(root / "runs" / "main")
@@ -304,7 +304,7 @@ def beat(folder: Path, at: float) -> None:
     write_json(folder / contract.STATUS_FILE, dataclasses.asdict(status))
 
 
-def test_a_patient_writer_takes_the_shot_from_one_that_fell_silent_elsewhere_and_from_no_other(shot):
+def test_patient_writer_takes_over_only_from_a_silent_remote_writer(shot):
     """The timeout only uses this computer's clock, because the other clock may be an hour off."""
     _, folder = foreign_job(shot)
     reasons: list[str] = []
@@ -320,7 +320,7 @@ def test_a_patient_writer_takes_the_shot_from_one_that_fell_silent_elsewhere_and
     assert not lock_of(shot).exists() and not list(shot.root.glob(".lock*"))
 
 
-def test_a_patient_writer_waits_for_one_of_its_own_computer_however_silent(shot):
+def test_patient_writer_waits_for_a_silent_local_writer(shot):
     pid = os.getpid()
     put_lock(shot, Writer(contract.computer_name(), pid, contract.process_start(pid), "train", "silent", time.time()))
     reasons: list[str] = []

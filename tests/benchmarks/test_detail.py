@@ -58,7 +58,7 @@ def test_figures_of_one_frame_are_what_they_are_called(scene):
     assert picture_figures(image, scene, torch.zeros_like(bad))["still_db"] is None
 
 
-def test_a_shifted_and_a_soft_picture_are_told(scene):
+def test_shifted_and_soft_pictures_are_distinguished(scene):
     still = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     same = picture_figures(scene, scene, still)
     assert same["gradient"] == 1.0 and same["whole_db"] == same["best_90_db"] == 120.0
@@ -89,7 +89,7 @@ def test_still_is_far_from_movers_and_known():
     assert not still[12:29, 22:39].any() and still[11, 30] and still[20, 39]
 
 
-def test_points_are_seen_where_the_other_camera_has_them():
+def test_points_project_into_the_second_camera():
     rng = np.random.default_rng(1)
     depth = rng.uniform(2.0, 5.0, (6, 8))
     K = np.array([[50.0, 0, 4.2], [0, 52.0, 2.9], [0, 0, 1]])
@@ -160,7 +160,7 @@ def test_a_flat_wall_is_not_judged_by_flow(scene):
     assert textured(scene).float().mean() > 0.8
 
 
-def test_percentiles_of_many_frames_are_those_of_all_values():
+def test_pooled_percentiles_equal_those_of_all_values():
     rng = np.random.default_rng(2)
     values = [rng.exponential(1.5, n) for n in (500, 3000, 40)]
     histogram = Histogram()
@@ -173,7 +173,7 @@ def test_percentiles_of_many_frames_are_those_of_all_values():
         assert histogram.percentile(percent) == pytest.approx(np.percentile(together, percent), abs=0.06)
 
 
-def test_difference_is_taken_where_asked():
+def test_difference_is_measured_inside_the_mask():
     a, b = torch.zeros(4, 4, 3), torch.zeros(4, 4, 3)
     b[0] = 0.5
     where = torch.zeros(4, 4, dtype=torch.bool)

@@ -45,7 +45,7 @@ def maps(folder: Path, time: int, pose: int, window: int = 1) -> dict[str, np.nd
     return found | {OBJECT_PREFIX + HELD: held_change_mask(geometry, geometry.at, time, pose, pose_view, window)}
 
 
-def test_what_is_held_stands_still_before_and_after_its_change(scene_folder):
+def test_changing_object_is_static_before_and_after_its_change(scene_folder):
     """Seed 0 of `tiny`: an arm and a hand change between frames 2 and 6, a person leaves between frames 0 and 8."""
     plan = json.loads((scene_folder / "plan.json").read_text())
     assert [each["name"] for each in plan[HELD]] == list(CAST[SEED])
@@ -63,7 +63,7 @@ def test_what_is_held_stands_still_before_and_after_its_change(scene_folder):
         assert vertices.shape[0] == TINY.frames
 
 
-def test_the_region_held_is_where_a_still_plate_shows_another_state(scene_folder):
+def test_held_region_is_where_a_static_plate_differs(scene_folder):
     """t* is 8, after every change; the poses are 0 (before) and 10 (after)."""
     before, after = (maps(scene_folder, 8, pose, window=0) for pose in (0, 10))
     assert set(CAST[SEED]) | {HELD} == {
@@ -79,7 +79,7 @@ def test_the_region_held_is_where_a_still_plate_shows_another_state(scene_folder
     assert region.sum() < 2.5 * (arm | left | before[OBJECT_PREFIX + "resting"]).sum()
 
 
-def test_what_a_plate_shows_in_the_middle_of_its_change_is_not_in_the_region_held(scene_folder):
+def test_held_region_excludes_objects_during_their_change(scene_folder):
     """At frame 4 the arm and the hand move and a person walks, which flow detects."""
     region, shown = maps(scene_folder, 8, 4)[OBJECT_PREFIX + HELD], maps(scene_folder, 4, 4)
     for name in CAST[SEED]:
@@ -116,7 +116,7 @@ def test_the_cast_has_every_role_and_no_head_turns_where_no_column_hides_it():
     assert all(seed % 4 in (2, 3) for seed in range(10) if "turned" in CAST[seed])
 
 
-def test_behind_the_truth_everything_is_in_its_other_state(scene_folder, tmp_path):
+def test_truth_background_shows_the_second_state(scene_folder, tmp_path):
     """In rendered pictures: at t* 8 a person has left; the other picture shows her at her former place."""
     folder = tmp_path / "rendered"
     shutil.copytree(scene_folder, folder)

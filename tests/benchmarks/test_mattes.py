@@ -15,7 +15,7 @@ def disc(radius=20.0, size=64):
     return np.hypot(x - size / 2, y - size / 2) < radius
 
 
-def test_a_lassos_corners_are_no_farther_off_than_it_is_sloppy():
+def test_lasso_corner_error_is_bounded_by_sloppiness():
     mask = disc()
     (drawn,), (straight,) = lassos(mask, 4.0, 3.0, seed=1), lassos(mask, 4.0, 0.0, seed=1)
     corners, exact = np.array(drawn), np.array(straight)

@@ -84,7 +84,7 @@ def test_masks_are_of_panes_in_which_nothing_moves(world):
     assert maps["seen"].all()
 
 
-def test_a_mirror_was_seen_where_the_other_view_saw_the_same_in_it(world):
+def test_mirror_pixels_are_seen_if_the_reflection_was_seen(world):
     of = view()
     mirror = region_maps(world, world.at(1), 1, of, of)[OBJECT_PREFIX + "mirror"]
     turned = region_maps(world, world.at(1), 1, of, view(1.2))

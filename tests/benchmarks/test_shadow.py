@@ -28,7 +28,7 @@ def pixel(view, point):
     return int(y), int(x)
 
 
-def test_the_shadow_lies_opposite_of_the_lamp_and_a_screen_takes_it_away(view):
+def test_shadow_is_opposite_the_lamp_and_blocked_by_a_screen(view):
     of = Set.on(np.zeros(3))
     left = shadow(RayScene(floor(), FACES), view, of)
     middle = of.ball - TO_LAMP * of.ball[2] / TO_LAMP[2]

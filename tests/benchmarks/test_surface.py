@@ -20,7 +20,7 @@ def camera(x):
     return View(viewmat, np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48)
 
 
-def test_a_place_is_as_far_off_as_from_the_nearest_surface_that_two_plates_see():
+def test_distance_is_to_the_nearest_surface_seen_by_two_plates():
     (wall, faces), (card, _) = square(5.0, 9.0), square(2.0, 0.5)
     truth = RayScene(np.concatenate([wall, card]), np.concatenate([faces, faces + 4]))
     views = [camera(-0.1), camera(0.0), camera(0.1)]

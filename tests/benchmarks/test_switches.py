@@ -20,7 +20,7 @@ def test_numbers_of_the_static_baseline_reach_its_repair(word, factor):
     assert repairs.repairs(DevelopConfig())[0].config == usual.config, "and is as before afterwards"
 
 
-def test_every_rule_can_be_switched_off():
+def test_every_rule_can_be_disabled():
     for name in RULES:
         with rules_disabled(frozenset({name})):
             pass

@@ -110,7 +110,7 @@ def test_a_scene_is_whole(scene):
     assert min(changed) > 1.0  # the camera moves in every frame
 
 
-def test_camera_stays_inside_the_room_and_people_stand_on_the_floor(scene):
+def test_camera_is_inside_the_room_and_people_on_the_floor(scene):
     static = np.load(scene.root / "geometry" / "static.npz")["vertices"]
     low, high = static.min(axis=0), static.max(axis=0)
     centres = scene.centres()
@@ -124,7 +124,7 @@ def test_camera_stays_inside_the_room_and_people_stand_on_the_floor(scene):
         assert 0.003 < drift.max() < 0.35 and np.median(drift) < 0.08  # still, but not frozen
 
 
-def test_truth_at_the_pose_of_its_own_instant_is_the_clips_frame(scene):
+def test_truth_at_its_clip_pose_equals_the_clip_frame(scene):
     assert (scene.truth(9, 9) == scene.frame(9)).all()
     regions = scene.regions(9, 9)
     assert regions.seen.all()
@@ -165,7 +165,7 @@ def test_cameras_depths_and_pictures_belong_together(scene, pose):
     assert error(0.0) < 0.75 * min(error(-2.0), error(2.0))
 
 
-def test_what_moves_are_people_and_what_stands_is_still(scene):
+def test_only_people_move(scene):
     moving = scene.frame_moving(9)
     assert 0.005 < moving.mean() < 0.5
     static = np.load(scene.root / "geometry" / "static.npz")["vertices"]
@@ -214,7 +214,7 @@ def test_killed_twice_it_goes_on_to_the_same_pictures(out, scene, tmp_path):
     assert "already there" in run_cli(tmp_path).communicate()[0]
 
 
-def test_what_an_older_generator_made_is_refused(out, scene, tmp_path, capfd):
+def test_scene_of_an_older_generator_is_refused(out, scene, tmp_path, capfd):
     copy = tmp_path / "tiny" / scene.root.name
     copy.mkdir(parents=True)
     write_json(copy / "scene.json", {**scene.info, "key": "another"})
@@ -341,7 +341,7 @@ def test_a_hard_scene_is_what_it_was(kind, hard):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in HARD if kind != HELD])
-def test_a_hard_scene_has_its_thing_in_view(kind, hard):
+def test_hard_scene_shows_its_object(kind, hard):
     maps = seen_from(hard[kind], kind, 8, 4)
     masks = {name.removeprefix(OBJECT_PREFIX): mask for name, mask in maps.items() if name.startswith(OBJECT_PREFIX)}
     assert set(masks) == ({"glass", "mirror", "wall"} if kind == "glass" else {kind})
@@ -374,7 +374,7 @@ def test_an_apple_swings_and_an_arm_gestures(hard):
 
 
 @pytest.mark.parametrize("kind", ["swinging", "arm"])
-def test_what_is_behind_a_thing_is_rendered_around_it(kind, hard):
+def test_background_of_an_object_is_rendered_around_it(kind, hard):
     plan = json.loads((hard[kind] / "plan.json").read_text())
     behind = {Path(job["out"]).name: job for job in plan["jobs"] if "box" in job}
     assert set(behind) == {"000001.png", "000005.png", "000009.png"}
@@ -387,7 +387,7 @@ def test_what_is_behind_a_thing_is_rendered_around_it(kind, hard):
         assert behind[f"{pose + 1:06d}.png"]["bands"][0]["time"] == 8.0
 
 
-def test_a_mirror_shows_the_room_and_a_thing_can_be_taken_away(hard, tmp_path):
+def test_mirror_shows_the_room_and_object_can_be_removed(hard, tmp_path):
     """In rendered pictures: with the mirror and with a black one; with and without the arm."""
 
     def render(kind: str, name: str, **changes) -> list[np.ndarray]:

@@ -82,7 +82,7 @@ def test_ctrl_c_lets_the_child_finish_its_checkpoint(tmp_path: Path, sent: signa
 
 
 @pytest.mark.skipif(os.name == "nt", reason="reads POSIX process groups")
-def test_a_child_that_ignores_ctrl_c_is_ended_with_its_own_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_child_ignoring_ctrl_c_is_killed_with_its_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(children, "GRACE_SECONDS", 0.5)
     grandchild = "import time; time.sleep(60)"
     stubborn = (
@@ -106,7 +106,7 @@ def test_a_child_that_ignores_ctrl_c_is_ended_with_its_own_children(tmp_path: Pa
     raise AssertionError("the grandchild lives on")
 
 
-def test_blenders_own_lines_go_to_the_log_alone(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_blender_output_goes_only_to_the_log(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     lines = [
         "00:01.3  render | Saved: 'x.png'",
         "  baking  4%",

@@ -93,7 +93,7 @@ def test_a_requirement_without_a_hash_is_not_installed(environment: Environment,
     assert not list(environment.folder.rglob("smallthing*"))
 
 
-def test_from_a_folder_of_wheels_no_index_is_asked(
+def test_wheel_folder_uses_no_index(
     environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, write_lock, write_wheel, make_environment
 ):
     make_environment(environment.folder)
@@ -113,7 +113,7 @@ def test_from_a_folder_of_wheels_no_index_is_asked(
     assert main.main(["setup", "--wheels", str(tmp_path / "absent"), "--output", str(tmp_path / "o")]) == 2
 
 
-def test_torch_alone_is_asked_of_its_index(
+def test_only_torch_uses_the_torch_index(
     with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_environment, write_lock, write_wheel
 ):
     """No other package is installed from that index, whatever its version."""
@@ -223,14 +223,14 @@ def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Env
     assert value_of(environment) == "1"
 
 
-def test_an_environment_of_ours_without_an_interpreter_is_made_anew(environment: Environment):
+def test_environment_without_an_interpreter_is_recreated(environment: Environment):
     environment.state.mkdir(parents=True)
     (environment.folder / "pyvenv.cfg").touch()
     set_up(environment, sys.executable)
     assert value_of(environment) == "1"
 
 
-def test_an_environment_made_by_hand_is_adopted(environment: Environment):
+def test_manually_created_environment_is_adopted(environment: Environment):
     subprocess.run([sys.executable, "-m", "venv", str(environment.folder)], check=True)
     kept = environment.folder / "kept"
     kept.touch()
@@ -238,7 +238,7 @@ def test_an_environment_made_by_hand_is_adopted(environment: Environment):
     assert environment.ready() and kept.exists()
 
 
-def test_a_folder_of_someone_else_is_left_alone(environment: Environment):
+def test_foreign_folder_is_not_changed(environment: Environment):
     environment.folder.mkdir(parents=True)
     precious = environment.folder / "precious.txt"
     precious.touch()
@@ -318,7 +318,7 @@ def test_an_index_out_of_reach_is_not_reckoned_with(
     assert "cannot be reached: torch comes from the usual index" in capsys.readouterr().out
 
 
-def test_no_other_environment_has_torch():
+def test_only_the_backend_environment_has_torch():
     assert environments.backend_environment(testing=True).torch
     assert not any(e.torch for e in (environments.bpy_environment("5.0"), environments.bench_environment()))
 
@@ -352,7 +352,7 @@ def test_every_package_of_a_lock_has_hashes():
         assert re.fullmatch(f"({entry})+", text), f"{path.name} has a line that pip would take on trust"
 
 
-def test_locks_have_the_versions_that_were_asked_for():
+def test_locks_match_requested_versions():
     """Fails after an edit of a list without a run of tools/lock_requirements.py."""
     folder = environments.REQUIREMENTS
     constraints = pins(folder / "constraints.txt")
@@ -384,7 +384,7 @@ def test_torch_of_this_version_is_known_by_its_hash_but_for_one_wheel():
         assert not lock("https://somewhere.else/simple", python)
 
 
-def test_an_index_that_does_not_answer_is_not_asked_for_every_package(tmp_path: Path):
+def test_unreachable_index_is_not_retried_for_every_package(tmp_path: Path):
     assert environments._reachable(tmp_path.as_uri())
     assert not environments._reachable("https://packages.invalid/whl/cpu")
     assert not environments._reachable("http://127.0.0.1:9/simple")

@@ -20,7 +20,7 @@ def printed_variables(capsys) -> dict[str, str]:
     return dict(line.split("=", 1) for line in lines)
 
 
-def test_a_host_that_is_given_its_python_and_blender_sets_nothing_up(tmp_path, capsys, monkeypatch):
+def test_farm_host_with_python_and_blender_needs_no_set_up(tmp_path, capsys, monkeypatch):
     # the host sets it in this process; monkeypatch restores it for later tests
     monkeypatch.setenv("SPLANNEQUIN_HOME", "")
     blender = tmp_path / "my blender"

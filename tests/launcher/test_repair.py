@@ -19,7 +19,7 @@ def site(tmp_path: Path, write_wheel) -> Path:
     return site
 
 
-def test_a_file_of_the_same_size_with_other_contents(site: Path, tmp_path: Path):
+def test_changed_file_of_equal_size_is_detected(site: Path, tmp_path: Path):
     (site / "one.py").write_text("value = 2")
     assert contract.changed_packages(tmp_path / "venv", contract.record_packages(tmp_path / "venv", ["one"])) == []
     assert repair.drop_damaged(tmp_path / "venv", {}) == ["one"]

@@ -14,7 +14,7 @@ from launcher.testing import Leg, progress, run_legs
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_counts_come_from_pytests_own_report(tmp_path: Path):
+def test_counts_come_from_the_pytest_report(tmp_path: Path):
     (tmp_path / "test_few.py").write_text(
         "import pytest\n"
         "def test_a(): pass\n"
@@ -50,7 +50,7 @@ print("ends", mine.name, other.exists(), flush=True)
 """
 
 
-def test_two_legs_run_beside_each_other_and_each_ones_output_stays_whole(tmp_path: Path, capfd):
+def test_two_legs_run_concurrently_with_separate_output(tmp_path: Path, capfd):
     pair = [tmp_path / "one", tmp_path / "two"]
     legs = [Leg(a.name, [sys.executable, "-c", MEETING, str(a), str(b)]) for a, b in (pair, pair[::-1])]
     single_leg = Leg(
@@ -103,7 +103,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
-def test_ctrl_c_reaches_every_leg_and_starts_no_other(tmp_path: Path):
+def test_ctrl_c_stops_every_leg_and_starts_none(tmp_path: Path):
     command = [sys.executable, "-P", "-c", INTERRUPTED, WAITING, str(tmp_path)]
     parent = subprocess.Popen(
         command, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -78,7 +78,7 @@ def test_the_lens_of_transforms(tmp_path, fields, model, bend):
     assert (lens.model, lens.params[4:]) == (model, bend)
 
 
-def test_a_lens_can_stand_in_each_frame_and_as_an_angle(tmp_path):
+def test_lens_can_be_given_per_frame_or_as_an_angle(tmp_path):
     file = transforms(tmp_path / "t.json", some_poses(3), w=200, h=100, camera_angle_x=math.pi / 2)
     data = json.loads(file.read_text())
     data["frames"][1] |= {"fl_x": 90.0, "cx": 99.0}
@@ -189,7 +189,7 @@ def test_unusable_transforms_are_a_sentence(tmp_path, change, words):
 
 
 @pytest.mark.parametrize("make", [lambda p: p / "gone", lambda p: p])
-def test_nothing_there_is_a_sentence(tmp_path, make):
+def test_missing_cameras_give_a_readable_error(tmp_path, make):
     with pytest.raises(JobError, match="does not exist|holds no cameras"):
         imported.read(make(tmp_path))
 
@@ -239,7 +239,7 @@ def test_matching_is_by_number_and_says_what_is_missing():
 
 
 @pytest.mark.parametrize("lost", [[], [19], [3, 4, 11], [0]])
-def test_pictures_counted_from_zero_are_no_frame_late_however_many_have_a_camera(lost):
+def test_zero_based_pictures_are_not_shifted_by_a_frame(lost):
     """In the last case the first picture has no camera, so it looks like a count from 1."""
     solve = fake_solve(20, first=0)
     solve.cameras = [c for n, c in enumerate(solve.cameras) if n not in lost]

@@ -35,7 +35,7 @@ def the_lens(scale=1):
     }  # fmt: skip
 
 
-def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
+def test_true_cameras_give_a_solve_in_their_world_space(solved, tools, tmp_path):
     """The room's true cameras at twice the picture size, without points: poses are exact, points lie on the walls."""
     shot = again(solved, tools, tmp_path)
     report = tools.recorder()
@@ -68,7 +68,7 @@ def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
     assert (shot.solve / "solve.json").stat().st_mtime_ns == before, "taken in once"
 
 
-def test_a_colmap_folder_brings_its_own_points(solved, tools, tmp_path):
+def test_colmap_folder_imports_its_points(solved, tools, tmp_path):
     shot = again(solved, tools, tmp_path, step=2)
     report = tools.recorder()
     result = solve_shot(shot, SolveConfig(), report, str(solved.shot.solve / "colmap"))
@@ -179,7 +179,7 @@ def test_an_export_never_hides_behind_another_model(solved, tmp_path):
         export_cameras(Shot.create(tmp_path / "new.splannequin"), "colmap", tmp_path / "out")
 
 
-def test_cameras_that_stand_still_are_refused(solved, tools, tmp_path):
+def test_static_cameras_are_refused(solved, tools, tmp_path):
     """No point can be triangulated."""
     shot = again(solved, tools, tmp_path)
     file = transforms(tmp_path / "transforms.json", [np.eye(4)] * 21, **the_lens())
@@ -202,7 +202,7 @@ def test_how_much_agrees_decides():
         refuse_misfit({**answer, "triangulation_angle_deg": 1.0}, 500)
 
 
-def test_refused_cameras_leave_the_solve_that_is_there(solved, tools, tmp_path):
+def test_refused_cameras_keep_the_existing_solve(solved, tools, tmp_path):
     before = (solved.shot.solve / "cameras.json").read_bytes()
     file = transforms(tmp_path / "t.json", some_poses(10), [f"{n}.png" for n in range(10)], **the_lens())
     with pytest.raises(JobError, match="Only 5 of the 11 frames"):

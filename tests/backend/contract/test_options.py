@@ -57,7 +57,7 @@ def test_every_option_changes_what_it_is_for_and_nothing_else(command, words, fi
         assert isinstance(params, contract.PARAMS[kind])
 
 
-def test_what_is_asked_for_without_an_option_is_each_fields_default_but_for_finished_frames():
+def test_without_options_every_field_has_its_default():
     for command in contract.COMMANDS:
         args = cli.parser().parse_args([command, *NEEDED.get(command, ("s.splannequin",))])
         for params in contract.requested_params(args).values():
@@ -148,7 +148,7 @@ def ask(*words):
     return contract.requested_params(cli.parser().parse_args([str(w) for w in words]))
 
 
-def test_freeze_of_a_shot_asks_for_the_freeze_alone_and_of_a_clip_for_everything(tmp_path):
+def test_freeze_of_a_shot_requests_one_step_and_of_a_clip_all(tmp_path):
     (tmp_path / "renamed").mkdir()
     (tmp_path / "renamed" / "shot.json").touch()
     (tmp_path / "pictures").mkdir()
@@ -193,7 +193,7 @@ def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, in
         (("export", "s.splannequin", "--output", "o", "--format", "nerfstudio", "--text"), "--text is passed over"),
     ],
 )
-def test_what_is_said_in_vain_or_in_an_old_word_is_told(words, note, capsys):
+def test_ignored_and_outdated_options_print_a_note(words, note, capsys):
     assert cli.main(list(words)) == contract.ExitCode.USAGE  # this shot does not exist
     first, _, rest = capsys.readouterr().err.partition("\n")
     assert first.startswith("note: ") and note in first and rest.count("\n") == 1
@@ -213,7 +213,7 @@ def test_what_is_heeded_has_no_note(words):
     assert contract.notes(cli.parser().parse_args(list(words))) == []
 
 
-def test_json_may_stand_before_the_verb_and_after_it(tmp_path, capsys):
+def test_json_flag_works_before_and_after_the_verb(tmp_path, capsys):
     assert contract.as_json(cli.parser().parse_args(["--json", "status", "s"]))
     assert contract.as_json(cli.parser().parse_args(["status", "s", "--json"]))
     assert not contract.as_json(cli.parser().parse_args(["status", "s"]))

@@ -77,7 +77,7 @@ def test_the_piece_that_moves_stays_open_and_little_else():
     assert stays[m.params["means"].detach()[:, 0] < 0.7].float().mean() < 0.03
 
 
-def test_what_cameras_that_are_a_little_off_make_of_a_still_scene_does_not_stay_open():
+def test_small_camera_errors_do_not_open_static_gaussians():
     m, rows = model(), torch.arange(400)
     moves = m.params["means"].detach()[:, 0] > 0.85
     # As measured on a real clip: half of all Gaussians change by more than the threshold, but none moves.

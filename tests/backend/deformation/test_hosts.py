@@ -49,7 +49,7 @@ def stir(field, scale=0.05):
     return field
 
 
-def test_the_hosts_of_the_issue_are_there():
+def test_all_expected_hosts_exist():
     assert {"hexplane", "mlp", "control_points"} <= set(HOSTS)
     with pytest.raises(ValueError, match="mlp"):
         registry.host("nerf")
@@ -57,7 +57,7 @@ def test_the_hosts_of_the_issue_are_there():
         registry.host_config("mlp", "published", 100)
 
 
-def test_only_a_host_with_an_axis_to_size_asks_how_many_nodes_time_needs():
+def test_only_hosts_with_a_time_axis_compute_its_node_count():
     """Computing the number of time nodes renders dozens of frames."""
     calls = []
 
@@ -185,7 +185,7 @@ def test_coincident_gaussians_give_finite_gradients(name, configuration):
 
 @pytest.mark.parametrize("configuration", registry.CONFIGURATIONS)
 @pytest.mark.parametrize("name", HOSTS)
-def test_restored_from_its_state_alone(name, configuration):
+def test_field_is_restored_from_its_state(name, configuration):
     field = stir(create(name, configuration))
     again = registry.host(name).restore(registry.host_config(name, configuration, 1000), field.state())
     means = cloud(15, 3).params["means"].detach()

@@ -99,7 +99,7 @@ def test_no_rows_at_all():
     assert all(float(p.grad.abs().max()) == 0.0 for p in leaves(*linear_layers))
 
 
-def test_the_field_goes_through_it_and_other_networks_go_through_torch(monkeypatch):
+def test_field_uses_the_kernel_and_other_networks_use_torch(monkeypatch):
     calls = []
     whole = network.network
     monkeypatch.setattr(network, "network", lambda *args: calls.append(args) or whole(*args))

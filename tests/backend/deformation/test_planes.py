@@ -141,7 +141,7 @@ def test_any_number_of_threads_gives_the_same_bits():
 
 @pytest.mark.parametrize("module", [planes, planes_cuda])
 @pytest.mark.parametrize("odd", [math.nan, math.inf, -math.inf])
-def test_a_point_that_is_nowhere_stays_on_the_rim(module, odd):
+def test_non_finite_point_is_clamped_to_the_border(module, odd):
     ours, _ = fields()
     leaves, where = on("cpu", ours), torch.full((3, 4), odd, requires_grad=True)
     value = module.features(where, leaves)
@@ -161,7 +161,7 @@ def test_no_points_at_all(body, features):
     assert value.shape == (0, 32) and not any(bool(p.grad.any()) for p in leaves)
 
 
-def test_other_planes_are_refused_by_the_processors_body_and_taken_by_torch():
+def test_unsupported_planes_fall_back_to_torch():
     (ours, exact), (odd, _) = fields(), fields(features=5)
     assert planes.supports(ours._by_level()) and not planes.supports(exact._by_level())
     with pytest.raises(ValueError, match="16"):

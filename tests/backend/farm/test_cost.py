@@ -86,7 +86,7 @@ def test_what_a_job_costs(shot, requests):
     assert estimate(steps, ONE, False, False).card_hours == 0.0
 
 
-def test_a_session_is_entered_again_after_so_many_tasks(shot, requests):
+def test_session_restarts_after_a_number_of_tasks(shot, requests):
     (one,) = shots_of(shot, requests)
     steps = steps_of(one, 5, False)
     keeps, enters = estimate(steps, ONE, False, False), estimate(steps, ONE, False, False, 1)
@@ -98,7 +98,7 @@ def test_a_session_is_entered_again_after_so_many_tasks(shot, requests):
     assert enters.critical_seconds == pytest.approx(keeps.critical_seconds), "the first task of each step enters, too"
 
 
-def test_hosts_are_asked_for_what_was_seen_and_half_as_much_again():
+def test_requested_memory_is_measured_memory_plus_half():
     needed = needs({"train": Rate(1, 1, 1, 2000), "bake": Rate(1, 1, 1, 700)}, True, 2.0)
     assert (needed["train"].memory_mib, needed["train"].gpu) == (3072, True)
     assert (needed["bake"].memory_mib, needed["bake"].gpu) == (1536, False)
@@ -131,7 +131,7 @@ def test_more_work_never_takes_less_time():
     assert steep.fixed == 0.0 and steep.per_unit == pytest.approx(3.0)
 
 
-def test_rates_of_a_file_stand_in_the_place_of_ours(tmp_path):
+def test_rates_file_overrides_built_in_rates(tmp_path):
     file = tmp_path / "rates.json"
     write_json(file, to_json({"train": Rate(1.0, 2.0, 3.0, 4)}))
     read = read_rates(file)

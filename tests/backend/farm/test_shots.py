@@ -13,7 +13,7 @@ from torch_backend.farm.shots import gather, parse_instants, read_instants, read
 from torch_backend.footage.images import write_png
 
 
-def test_takes_are_named_by_their_instants_where_there_are_several(shot, requests):
+def test_several_takes_are_named_by_their_instants(shot, requests):
     roots = [str(shot("hall").root), str(shot("kitchen").root)]
     hall, kitchen = gather(roots, requests(take="hero"), [4, 12], {"kitchen": [7]}, "")
     assert hall.takes == {"4": "hero_0004", "12": "hero_0012"} and kitchen.takes == {"7": "hero"}
@@ -82,7 +82,7 @@ LONG = "the_long_and_winding_name_of_a_clip_that_somebody_gave_it"
         ("c/Hall.mp4", "d/hall.mp4", "e/h\u00e4ll.mp4", "f/ha\u0308ll.mp4"),
     ],
 )
-def test_no_two_clips_have_one_shot_and_each_finds_its_own_again(clip, requests, tmp_path, names, in_one_folder):
+def test_clips_get_distinct_shots_and_find_them_again(clip, requests, tmp_path, names, in_one_folder):
     clips = [clip(name) for name in names]
     folder = str(tmp_path / "shots") if in_one_folder else ""
     found = {one.clip: one for one in gather(clips, requests(), [], {}, folder)}
@@ -95,7 +95,7 @@ def test_no_two_clips_have_one_shot_and_each_finds_its_own_again(clip, requests,
         assert entry.root == found[path].root, "as it is found alone"
 
 
-def test_a_clip_has_the_shot_that_was_made_of_it_and_no_other(clip, imported, requests, tmp_path):
+def test_clip_matches_only_the_shot_imported_from_it(clip, imported, requests, tmp_path):
     path, folder = clip("hall.mp4"), tmp_path / "clips"
     (one,) = gather([path], requests(), [], {}, "")
     assert one.root == folder / "hall.splannequin" and (one.name, one.output) == ("hall", "hall")
@@ -128,7 +128,7 @@ def test_names_that_every_task_would_refuse_are_refused_at_once(shot, requests, 
         gather([str(shot("hall").root)], requests(**{field: name}), [], {}, "")
 
 
-def test_what_is_done_is_told_from_what_is_not(shot, requests):
+def test_finished_work_is_distinguished_from_open_work(shot, requests):
     hall = shot("hall")
     (one,) = gather([str(hall.root)], requests(), [], {}, "")
     assert (one.solved, one.trained) == (False, False)
@@ -183,7 +183,7 @@ def test_a_list_of_instants(tmp_path):
         parse_instants("x")
 
 
-def test_parameters_of_a_file_stand_over_the_options(tmp_path, requests):
+def test_file_parameters_override_options(tmp_path, requests):
     file = tmp_path / "request.json"
     write_json(file, {"freeze": {"width": 320, "t_star_per_frame": {"3": 4.0}}, "train": {"preset": "final"}})
     read = read_requests(str(file), requests(take="hero"))

@@ -67,7 +67,7 @@ def test_blurred_pillars_are_found_where_they_are(world, size):
     assert find_bars([np.ascontiguousarray(picture.T) for picture in pictures]) == Bars(top=size, bottom=size)
 
 
-def test_a_subtitle_in_a_bar_and_a_picture_that_is_dark_at_the_other_do_not_hide_them(world):
+def test_bars_are_found_despite_subtitles_and_dark_pictures(world):
     frames = barred([(f * np.linspace(1, 0.05, HEIGHT)[:, None, None]).astype(np.uint8) for f in world], 20, 20)
     for frame in frames[:12]:
         frame[6:12, 70:110] = 255

@@ -71,7 +71,7 @@ def test_pictures_that_hold_no_depth_are_of_no_use(tmp_path, channels):
         read_map(tmp_path / "a.exr")
 
 
-def test_maps_go_by_number_and_what_is_of_no_use_is_told_with_its_reason(world, quiet, tmp_path):
+def test_maps_match_by_number_and_unusable_ones_are_reported(world, quiet, tmp_path):
     folder = tmp_path / "depth"
     for n in range(16):
         write(folder / f"d.{101 + n:04d}.exr", {"Z": RAMP + n})
@@ -99,7 +99,7 @@ def test_the_key_follows_the_contents(world, quiet, tmp_path):
     assert find_depth(world.shot, str(tmp_path), quiet()).key != before
 
 
-def test_a_folder_that_is_not_there_or_holds_no_sequence_is_refused(world, quiet, tmp_path):
+def test_missing_folder_or_no_sequence_is_refused(world, quiet, tmp_path):
     for place in (tmp_path / "nowhere", tmp_path):
         with pytest.raises(JobError) as refused:
             find_depth(world.shot, str(place), quiet())

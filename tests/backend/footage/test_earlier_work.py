@@ -54,9 +54,7 @@ def contents(shot):
 
 
 @pytest.mark.parametrize("change", ["clip", "range", "height", "colour"])
-def test_an_import_of_other_frames_into_a_shot_with_work_is_refused_and_changes_nothing(
-    worked_on, clips, recorder, change
-):
+def test_import_of_different_frames_into_a_shot_with_work_is_refused(worked_on, clips, recorder, change):
     before = contents(worked_on)
     settings = {"range": {"first": 3}, "height": {"working_height": 24}, "colour": {"levels": "full"}}.get(change, {})
     with pytest.raises(JobError) as refused:

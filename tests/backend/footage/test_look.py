@@ -92,6 +92,6 @@ def test_what_is_no_look_is_refused_in_one_sentence(tmp_path, pan, write_video, 
     assert caught.value.exit_code == ExitCode.FOOTAGE
 
 
-def test_a_look_and_a_colour_space_are_one_too_many():
+def test_look_and_colour_space_together_are_refused():
     with pytest.raises(JobError, match="are both given"):
         told_in(FootageConfig(lut="a.cube", colour_space="ACEScg"))

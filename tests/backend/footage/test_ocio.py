@@ -85,7 +85,7 @@ LOGS = ["ARRI LogC3 (EI800)", "ARRI LogC4", "S-Log3 S-Gamut3", "V-Log V-Gamut", 
 
 
 @pytest.mark.parametrize("space", ["ACEScg", "ACES2065-1", "Linear Rec.2020", *LOGS])
-def test_light_goes_there_and_comes_back(space):
+def test_linear_light_round_trips(space):
     """OpenImageIO encodes light of 0.001 to 50 and -0.01; our decoding agrees with the light and with OpenImageIO's
     decoding."""
     codes = converted(swatches(), "lin_rec709_scene", space)
@@ -147,7 +147,7 @@ def test_a_chosen_space_outdoes_what_the_file_says(tmp_path):
     assert relative_error(read(folder, "ACEScg")[0], swatches()) < 1e-3
 
 
-def test_srgb_stays_as_it_stands_to_the_bit():
+def test_srgb_is_bit_identical():
     assert Colours("sRGB - Display").space() == InputSpace("srgb")
     assert Colours("cineon").space() == InputSpace("cineon"), "what only we name is known, too"
 

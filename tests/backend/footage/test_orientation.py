@@ -68,9 +68,7 @@ def test_a_video_is_shown_by_its_display_matrix_when_read_and_when_read_again(tm
 
 
 @pytest.mark.parametrize("matrix", [(COS, SIN, -SIN, COS), (0, 2, -1, 0), (1, 0.5, 0, 1), (0, 0, 0, 0)])
-def test_a_matrix_that_is_none_of_the_eight_is_told_and_shows_the_picture_as_it_is_stored(
-    tmp_path, pan, write_video, matrix
-):
+def test_unsupported_display_matrix_is_reported_and_ignored(tmp_path, pan, write_video, matrix):
     frames = pan(8)
     write_video(tmp_path / "a.mp4", frames)
     set_matrix(tmp_path / "a.mp4", *matrix)

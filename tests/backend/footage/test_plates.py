@@ -83,7 +83,7 @@ def test_a_clip_of_the_working_size_is_the_undistorted_frames(tmp_path, shot_of,
     assert half.display(3).shape == (24, 32, 3) and half.key != plates.key
 
 
-def test_a_larger_clip_is_read_at_its_own_size(tmp_path, shot_of, pan, write_video):
+def test_larger_clip_is_read_at_full_size(tmp_path, shot_of, pan, write_video):
     frames = pan(12, height=96, width=128)
     write_video(tmp_path / "a.mp4", frames)
     shot = shot_of(tmp_path / "a.mp4", working_height=48, first=3)
@@ -246,7 +246,7 @@ def test_footage_that_is_gone_is_said_and_the_working_frames_serve(tmp_path, pan
     assert (plates.display(4).numpy() == working_of(shot, 4)).all()
 
 
-def test_moved_and_copied_footage_is_found_other_footage_is_refused(tmp_path, pan, write_video, shot_of):
+def test_moved_footage_is_found_and_different_footage_refused(tmp_path, pan, write_video, shot_of):
     clip = tmp_path / "clips" / "a.mp4"
     clip.parent.mkdir()
     write_video(clip, pan(10, height=96, width=128))
@@ -297,7 +297,7 @@ def test_a_file_that_breaks_meanwhile_is_named(tmp_path, shot_of):
         plates.display(1005)
 
 
-def test_a_lens_that_is_not_told_is_said(tmp_path, pan, write_video, shot_of):
+def test_missing_lens_is_reported(tmp_path, pan, write_video, shot_of):
     write_video(tmp_path / "a.mp4", pan(10, height=96, width=128))
     shot = shot_of(tmp_path / "a.mp4", working_height=48)
     solved(shot, camera_model="OPENCV_FISHEYE", distortion=[0.1, 0.0, 0.0, 0.0])
@@ -305,7 +305,7 @@ def test_a_lens_that_is_not_told_is_said(tmp_path, pan, write_video, shot_of):
     assert plates.width == 64 and "OPENCV_FISHEYE" in plates.note
 
 
-def test_no_more_plates_are_held_than_asked_and_the_last_ones_stay(tmp_path, pan, write_video, shot_of):
+def test_plate_cache_is_bounded_and_keeps_recent_plates(tmp_path, pan, write_video, shot_of):
     write_video(tmp_path / "a.mp4", pan(20, height=96, width=128))
     shot = shot_of(tmp_path / "a.mp4", working_height=48)
     plates = Plates(shot, keep=3)

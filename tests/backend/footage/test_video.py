@@ -100,7 +100,7 @@ def interlaced(tmp_path, frame_of_planes):
 
 
 @pytest.mark.parametrize("top_first", [True, False])
-def test_interlaced_clips_become_whole_pictures_and_say_so(interlaced, top_first):
+def test_interlaced_clips_are_deinterlaced_and_reported(interlaced, top_first):
     path, firsts = interlaced(top_first)
     source, got = decoded(path)
     assert [f.number for f in got] == list(range(1, 13))
@@ -127,7 +127,7 @@ def woven(frames, top_first=True):
 
 
 @pytest.mark.parametrize("top_first", [True, False])
-def test_a_clip_that_is_interlaced_without_saying_so_becomes_whole_pictures(tmp_path, pan, write_video, top_first):
+def test_unmarked_interlaced_clip_is_deinterlaced(tmp_path, pan, write_video, top_first):
     frames = pan(40, 96, 128, speed=3)
     write_video(tmp_path / "a.mp4", woven(frames, top_first))
     source, got = decoded(tmp_path / "a.mp4")
@@ -214,7 +214,7 @@ def truncated_clip(tmp_path, pan, write_video):
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
-def test_a_file_that_breaks_off_says_how_much_of_it_there_is(truncated_clip, suffix):
+def test_truncated_file_reports_its_readable_part(truncated_clip, suffix):
     source, got = decoded(truncated_clip(suffix, 0.75))
     assert 12 <= len(got) < 24
     assert [f.number for f in got] == list(range(1, len(got) + 1))
@@ -230,7 +230,7 @@ def test_less_than_half_of_a_file_is_refused(truncated_clip, suffix, share):
     assert error.value.exit_code == ExitCode.FOOTAGE
 
 
-def test_a_clip_that_changes_its_size_ends_there_and_says_so(tmp_path, pan, write_video):
+def test_clip_ends_at_a_size_change_with_a_warning(tmp_path, pan, write_video):
     """Motion JPEG stores the size in every picture."""
     write_video(tmp_path / "a.mkv", pan(12), codec="mjpeg", pix_fmt="yuvj444p")
     write_video(tmp_path / "b.mkv", pan(12, height=64, width=48), codec="mjpeg", pix_fmt="yuvj444p")
@@ -298,7 +298,7 @@ def test_pixels_that_no_lens_makes_are_taken_as_square(tmp_path, pan, write_vide
     assert source.warnings[0][0] == "The footage claims pixels 5 times as wide as high: taken as square."
 
 
-def test_sound_alone_is_no_video(tmp_path):
+def test_audio_only_file_is_refused(tmp_path):
     with av.open(str(tmp_path / "a.wav"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
@@ -309,7 +309,7 @@ def test_sound_alone_is_no_video(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["index missing", "copy broken off", "never closed", "zeros behind"])
-def test_a_recording_that_was_not_finished_is_told_so(tmp_path, pan, write_video, how):
+def test_unfinished_recording_is_reported(tmp_path, pan, write_video, how):
     """MP4 and QuickTime store their index at the end."""
     write_video(tmp_path / "a.mp4", pan(8))
     data = (tmp_path / "a.mp4").read_bytes()
@@ -343,7 +343,7 @@ def two_streams(tmp_path, pan):
     return tmp_path / "a.mov", [video[0] for video in videos]
 
 
-def test_which_of_two_streams_is_read_is_said_and_the_other_can_be_named(two_streams):
+def test_chosen_video_stream_is_reported_and_selectable(two_streams):
     path, firsts = two_streams
     source, got = decoded(path)
     assert source.warnings == [

@@ -76,7 +76,7 @@ def source(array):
     return Made(array.shape, lambda rows: array[rows].astype(np.float64))
 
 
-def test_layers_made_while_they_are_written_give_the_same_file(tmp_path):
+def test_streamed_layers_give_the_same_file(tmp_path):
     stored = layers(150, 60)
     detail, grain = detail_of(stored), np.random.default_rng(3).normal(size=(150, 60, 3)).astype(np.float32)
     whole = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, grain=grain, detail=detail, **stored)
@@ -87,7 +87,7 @@ def test_layers_made_while_they_are_written_give_the_same_file(tmp_path):
     np.testing.assert_array_equal(a, b)
 
 
-def test_a_wrong_layer_made_while_it_is_written_leaves_no_file(tmp_path):
+def test_invalid_streamed_layer_leaves_no_file(tmp_path):
     stored = layers(150, 60)
     stored["depth"][130, 7] = np.nan
     with pytest.raises(ValueError, match=r"^depth has 1 NaN or infinite values, the first at \(7, 130\)"):
@@ -97,7 +97,7 @@ def test_a_wrong_layer_made_while_it_is_written_leaves_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_layers_made_while_they_are_written_are_never_whole_in_memory(tmp_path):
+def test_streamed_layers_are_never_fully_in_memory(tmp_path):
     height, width = 3000, 500
     flat = {name: Made((height, width), lambda rows: np.full((min(rows.stop, height) - rows.start, width), 0.5))
             for name in ("depth", "support", "motion")}  # fmt: skip
@@ -110,7 +110,7 @@ def test_layers_made_while_they_are_written_are_never_whole_in_memory(tmp_path):
 
 
 @pytest.mark.parametrize("with_grain", [False, True])
-def test_what_a_frame_is_made_of_comes_back_and_may_be_absent(tmp_path, with_grain):
+def test_source_layers_round_trip_and_are_optional(tmp_path, with_grain):
     stored = layers(150, 60)  # more rows than one write holds
     detail, grain = detail_of(stored), np.full((150, 60, 3), 0.25, np.float32) if with_grain else None
     path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, grain=grain, detail=detail, margin=(3, 2), **stored)
@@ -131,7 +131,7 @@ def test_what_a_frame_is_made_of_comes_back_and_may_be_absent(tmp_path, with_gra
 
 
 @pytest.mark.parametrize("name", ["splat", "plate", "source"])
-def test_a_bad_layer_of_what_a_frame_is_made_of_is_named(tmp_path, name):
+def test_invalid_source_layer_is_named(tmp_path, name):
     stored = layers()
     good = detail_of(stored)
     flat = dataclasses.replace(good, **{name: getattr(good, name)[:5]})
@@ -145,7 +145,7 @@ def test_a_bad_layer_of_what_a_frame_is_made_of_is_named(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_layer_that_is_a_row_of_the_table_needs_nothing_else_here(tmp_path, monkeypatch):
+def test_new_layer_needs_only_a_table_row(tmp_path, monkeypatch):
     rows = (
         FrameLayer("Distance", ("Distance.V",), "float", "Distance.V", "from the camera", part="distance"),
         FrameLayer("Sky", tuple(f"Sky.{c}" for c in "RGBA"), "half", "Sky.R G B A", "what is far", part="sky"),

@@ -91,7 +91,7 @@ def test_the_moved_camera_sees_the_same_picture(degree):
     assert abs(float(ratio.median()) / 12.5 - 1.0) < 1e-4
 
 
-def test_the_way_there_and_back():
+def test_placement_and_its_inverse_cancel():
     where = Similarity.of(Placement([0, -3, 0, 1, 3, 0, 0, 2, 0, 0, 3, -5, 0, 0, 0, 1]))
     assert where.scale == pytest.approx(3.0) and np.allclose(where.rotation @ where.rotation.T, np.eye(3), atol=1e-15)
     np.testing.assert_allclose(where.after(where.inverse()).matrix, np.eye(4), atol=1e-12)

@@ -101,7 +101,7 @@ def test_budget_is_never_exceeded_and_nan_is_pruned():
     assert torch.isfinite(model.params["means"]).all()
 
 
-def test_a_hosts_own_parameters_ride_through_growth_and_checkpoints():
+def test_host_parameters_survive_growth_and_checkpoints():
     model = small_model()
     hyper = model.adopt("hyper", (2,), -0.01)
     with torch.no_grad():

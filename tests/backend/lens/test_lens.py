@@ -108,7 +108,7 @@ def test_the_lens_is_colmaps_both_ways(colmap, shot_of, name):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_there_and_back_is_the_identity_to_a_millionth_of_a_pixel(shot_of, name):
+def test_distort_and_undistort_cancel_to_a_millionth_of_a_pixel(shot_of, name):
     lens = load_lens(shot_of(name))
     lens.check()
     at = centres(WIDTH, HEIGHT).reshape(-1, 2)

@@ -128,7 +128,7 @@ def test_sixteen_bits_are_smoothed(tmp_path):
     assert error_px(lens) < 0.02
 
 
-def test_what_is_cut_off_or_empty_or_transparent_says_nothing(tmp_path):
+def test_invalid_map_areas_are_ignored(tmp_path):
     st = undistorting(beyond=0.2)
     inside = ((st > 0) & (st < 1)).all(-1, keepdims=True)
     for name, path in {
@@ -162,7 +162,7 @@ def test_layers(tmp_path):
         read(written(tmp_path, st[..., :1], names=("Y",), name="grey.exr"))
 
 
-def test_anamorphic_footage_in_its_own_pixels_or_square_ones(tmp_path):
+def test_anamorphic_maps_work_for_stored_and_square_pixels(tmp_path):
     st = undistorting(beyond=0.2)
     footage = {"reading": {"pixel_aspect": 2.0}}
     for variant in (st, 0.5 * (st[:, ::2] + st[:, 1::2])):
@@ -222,7 +222,7 @@ def test_what_is_no_map_of_this_lens_is_refused_in_a_sentence(tmp_path, change, 
     assert refused.value.message.startswith("The ST map map.exr ")
 
 
-def test_a_map_of_the_other_picture_s_shape_is_refused_the_other_way_round_too(tmp_path):
+def test_map_of_a_different_shape_is_refused_in_both_directions(tmp_path):
     with pytest.raises(JobError, match="another shape"):
         read(written(tmp_path, redistorting()[:, 40:280]), "redistort")
 
@@ -245,7 +245,7 @@ def test_a_map_that_bends_nothing_is_taken_and_said(tmp_path):
     assert lens.is_none and lens.window == (1.0, 1.0) and "bends nothing" in heard[0]
 
 
-def test_files_are_told_apart_by_what_is_in_them(tmp_path):
+def test_map_type_is_detected_by_content(tmp_path):
     one = written(tmp_path, undistorting(), name="a.exr")
     (tmp_path / "copy.exr").write_bytes((tmp_path / "a.exr").read_bytes())
     assert fingerprint(one) == fingerprint(str(tmp_path / "copy.exr"))

@@ -107,7 +107,7 @@ def test_a_map_the_wrong_way_round_is_noticed(clip, tools, tmp_path):
     assert [w for w in report.warnings if "Through the ST map the frames are still bent, by" in w]
 
 
-def test_other_cameras_and_a_map_are_one_lens_too_many(clip, tools):
+def test_imported_cameras_and_a_map_together_are_refused(clip, tools):
     shot, _, folder = clip
     with pytest.raises(JobError, match="bring their own lens") as refused:
         solve_shot(shot, SolveConfig(st_map=str(folder / "undistort.exr")), tools.recorder(), cameras=str(folder))
@@ -118,7 +118,7 @@ def test_other_cameras_and_a_map_are_one_lens_too_many(clip, tools):
         solve_shot(shot, SolveConfig(st_map=str(folder / "gone.exr")), tools.recorder())
 
 
-def test_a_map_is_told_by_what_is_in_it_and_not_by_where_it_lies(clip, tools):
+def test_map_is_identified_by_content_not_path(clip, tools):
     """A copy of the file keeps the solve; another direction of the map does not."""
     from torch_backend.sfm.solving import _key  # pyright: ignore[reportPrivateUsage]
 
@@ -129,7 +129,7 @@ def test_a_map_is_told_by_what_is_in_it_and_not_by_where_it_lies(clip, tools):
     assert _key(plain, frames, [], {}) == _key(SolveConfig(st_map_way="redistort"), frames, [], {})
 
 
-def test_no_other_lens_is_tried_where_the_map_is_the_lens(tmp_path):
+def test_map_lens_disables_lens_retries(tmp_path):
     lens = {"doubt": "bent", "found_bend": -0.4, "found_deg": 140.0, "view_deg": 70.0, "held": True}
     answer = {"result": {"registered": 9, "lens": lens}}
     best = Attempt("first", tmp_path, answer, Fault("bent", JobError("a")), 9)

@@ -207,7 +207,7 @@ def test_frames_between_keys_have_a_matte_too(tmp_path, quiet):
     assert np.mean([np.linalg.norm(middle(labels[n]) - middle(board[n])) for n in between]) < 3.0
 
 
-def test_mattes_that_are_there_are_left_alone(swaying, quiet):
+def test_existing_mattes_are_kept(swaying, quiet):
     shot, _, result = swaying
     before = stamps(shot)
     assert find_motion(shot, quiet(), static_model=None) == result
@@ -262,7 +262,7 @@ def test_what_neither_a_static_model_nor_most_frames_show_moves(tmp_path, quiet)
     assert (np.delete(labels, 6, axis=0) == MOVING).mean() < 0.01
 
 
-def test_a_damaged_matte_is_named_and_made_anew(swaying, quiet):
+def test_damaged_matte_is_reported_and_recomputed(swaying, quiet):
     shot, *_ = swaying
     victim = shot.solve / "motion" / f"{NUMBERS[3]:06d}.png"
     whole = victim.read_bytes()
@@ -273,7 +273,7 @@ def test_a_damaged_matte_is_named_and_made_anew(swaying, quiet):
     assert victim.read_bytes() == whole
 
 
-def test_mattes_of_other_cameras_are_not_read(swaying, tmp_path, quiet):
+def test_mattes_of_an_older_solve_are_not_read(swaying, tmp_path, quiet):
     shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
     key = motion_key(shot)
     path = CameraPath.load(shot.solve / "cameras.json")
@@ -326,7 +326,7 @@ def test_a_killed_search_goes_on_where_it_was(swaying, tmp_path, quiet):
     assert (first.xyz == second.xyz).all() and (first.frames == second.frames).all()
 
 
-def test_a_shot_without_cameras_says_so(tmp_path, quiet):
+def test_missing_cameras_are_reported(tmp_path, quiet):
     shot = Shot.create(tmp_path / "empty.splannequin")
     with pytest.raises(JobError, match="has no cameras yet"):
         find_motion(shot, quiet(), static_model=None)
@@ -372,7 +372,7 @@ def test_what_moves_gives_no_points(swaying):
         assert len(x) > 500 and inner(board)[n][y, x].mean() < 0.01
 
 
-def test_a_camera_that_stands_still_gives_no_points(tmp_path, quiet):
+def test_static_camera_gives_no_points(tmp_path, quiet):
     shot, _ = build(tmp_path, travel=0.0)
     find_motion(shot, quiet(), static_model=None)
     assert not len(load_surface(shot).xyz)
@@ -499,7 +499,7 @@ def test_damaged_paint_is_named(shot_copy):
         load_motion(shot_copy, NUMBERS[0])
 
 
-def test_paint_that_announces_too_many_pixels_is_refused_before_they_are_read(shot_copy):
+def test_oversized_paint_is_refused_before_decoding(shot_copy):
     paint(shot_copy, np.full((HEIGHT, WIDTH), 255, np.uint8))
     file = shot_copy.painted_matte(NUMBERS[0])
     content = bytearray(file.read_bytes())
@@ -514,7 +514,7 @@ def test_paint_that_announces_too_many_pixels_is_refused_before_they_are_read(sh
 
 
 @pytest.mark.parametrize("order", ["cv2, OpenImageIO, av", "OpenImageIO, av, cv2", "torch, av, cv2, OpenImageIO"])
-def test_opencv_lives_beside_the_other_readers_of_pictures(order, tmp_path):
+def test_opencv_coexists_with_other_image_readers(order, tmp_path):
     """Each library brings its own zlib, libpng or FFmpeg; pycolmap's libraries conflict with OpenImageIO's."""
     clip = Path(__file__).resolve().parents[3] / "examples" / "sitting.mp4"
     code = f"""

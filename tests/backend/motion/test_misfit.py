@@ -60,7 +60,7 @@ def test_what_the_world_at_rest_lacks_is_found_whatever_noise_and_exposure(sigma
 
 
 @pytest.mark.parametrize("sigma", [0.0, 2.0, 8.0])
-def test_noise_alone_is_no_mover(sigma: float) -> None:
+def test_noise_is_not_a_mover(sigma: float) -> None:
     assert moving(noisy(wall(), sigma, 1), noisy(wall(), sigma, 2), around(sigma)).mean() < 0.01
 
 
@@ -76,13 +76,13 @@ def test_one_witness_that_errs_makes_no_mover() -> None:
     assert not moving(noisy(wall(), 2.0, 1), noisy(wall(), 2.0, 2), witnesses).any()
 
 
-def test_a_frame_that_is_unlike_everywhere_has_no_movers() -> None:
+def test_frame_that_differs_everywhere_has_no_movers() -> None:
     """A flash, or a wrong pose."""
     assert moving(255 - wall(), wall(), around()).mean() < 0.01
     assert moving(wall(7), wall(), around()).mean() < 0.01
 
 
-def test_what_only_four_other_frames_have_in_their_picture_is_not_known() -> None:
+def test_four_witness_frames_are_not_enough() -> None:
     frame = wall()
     frame[disc(8.0)] = 200, 30, 30
     far_view = np.eye(4)

@@ -63,7 +63,7 @@ def covering(tools, n=24, width=130, height=90):
     return scene
 
 
-def test_forward_is_deterministic_and_passes_keep_their_own_state(tools, device):
+def test_forward_is_deterministic_and_passes_do_not_share_state(tools, device):
     a = tools.cloud(300, 50, 40, seed=1, degree=1, with_depth=True, with_contributions=True, with_top=True, channels=5)
     b = tools.cloud(170, 44, 36, seed=2)
     first, _ = gradients(a, device)
@@ -123,7 +123,7 @@ def test_the_first_call_of_a_size_lists_all_its_hits(tools, device, monkeypatch)
     assert wanted <= listed
 
 
-def test_kernels_of_a_module_are_made_together(monkeypatch):
+def test_kernels_of_a_module_are_compiled_together(monkeypatch):
     # If a kernel were added later, Warp would unload the others, which CUDA graphs still use.
     wp = initialised_warp()
     monkeypatch.setattr(cuda, "_kernels", {("", 0): cuda._structure(wp)})
@@ -157,7 +157,7 @@ def test_wide_tile_numbers_sort_alike(tools, device, monkeypatch):
     assert_same_images(narrow, on_host(run(scene, device)))
 
 
-def test_too_many_channels_are_refused(tools, device):
+def test_channel_count_above_the_limit_is_refused(tools, device):
     with pytest.raises(ValueError, match="at most 56"):
         run(tools.cloud(3, 9, 9, channels=57), device)
 

@@ -429,7 +429,7 @@ def test_footprints_at_the_frustum_edge_are_bounded(body, generated):
 
 
 @on_every_body
-def test_a_camera_of_a_batch_sees_what_it_sees_alone(body, generated):
+def test_batched_camera_equals_a_single_camera(body, generated):
     def holds(scene):
         scene.Ks[1, [0, 1], [0, 1]] *= 1.25
         both, grads = squared(scene)

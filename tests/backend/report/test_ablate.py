@@ -39,7 +39,7 @@ def current_value(switch):
 
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=lambda rule: rule.name)
-def test_a_rule_is_off_and_on_again(rule):
+def test_disabled_rule_is_restored(rule):
     before = [current_value(switch) for switch in rule.switches]
     with pytest.raises(ArithmeticError), rules_disabled(frozenset({rule.name})):
         assert all(current_value(switch) is not was for switch, was in zip(rule.switches, before, strict=True))
@@ -73,7 +73,7 @@ def brightened(step, counts=None):
     return brighten
 
 
-def test_steps_that_variants_share_are_made_once(instants, clip):
+def test_shared_steps_of_variants_run_once(instants, clip):
     """Switching `develop` off reuses the earlier steps; switching a frame rule off reuses all steps."""
     counts = Counter[str]()
     with replaced("instant.repairs", "develop", functools.partial(brightened, counts=counts)):
@@ -152,7 +152,7 @@ def test_digests_tell_content_and_not_objects():
     assert len({digest([a]), digest([a.double()]), digest([a[:2]]), digest([a + 1]), digest([])}) == 5
 
 
-def test_what_is_let_go_is_held_against_what_was_painted(clip, tmp_path, monkeypatch):
+def test_rejected_pixels_are_scored_against_painted_masks(clip, tmp_path, monkeypatch):
     """The whole plate is painted as another state, so the removed fraction of a frame is its IoU."""
     t_star, frame = clip.run.train_frames[6], clip.run.train_frames[2]
     whole = Polygon(

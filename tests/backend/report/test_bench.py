@@ -137,7 +137,7 @@ def test_a_record_holds_every_frame_and_its_regions(done, scene):
         }
 
 
-def test_runs_that_share_a_training_come_one_after_the_other_and_train_once(done):
+def test_runs_sharing_a_training_are_adjacent_and_train_once(done):
     results, runs, _ = done
     spec, variant = only(runs, ("auto", "support"))[0], frozen_at_t_star(runs)
     nearest, plain = (load_record(results / f"{s.run_id}.json") for s in (spec, variant))
@@ -160,7 +160,7 @@ def test_published_settings_are_what_is_trained(scene, tmp_path):
     assert config_from_json(trained) == spec.config()
 
 
-def test_the_last_third_of_a_run_has_a_pace_of_its_own(tmp_path):
+def test_pace_is_measured_in_the_last_third_of_a_run(tmp_path):
     # Ten measurements of 100 steps: 20 ms per step, then 50 ms from the 7th on; an interruption repeated the 8th.
     rows = [{"iteration": 100 * n, "seconds": 2.0 * min(n, 6) + 5.0 * max(0, n - 6)} for n in range(1, 11)]
     rows.insert(7, {"iteration": 800, "seconds": 99.0})
@@ -217,7 +217,7 @@ def working(run_id: str) -> bool:
     return any(run_id in line and "--work" in line for line in found.stdout.splitlines())
 
 
-def test_a_run_that_fails_is_told_and_the_rest_goes_on(scene, tmp_path):
+def test_failed_run_is_reported_and_others_continue(scene, tmp_path):
     runs, _ = plan([f"truth:{scene[0]}"], tmp_path, **SIZE)
     bad = dataclasses.replace(only(runs, ("static", "none"))[0], overrides={"sh_degree": "two"})
     failures = run_plan([bad], tmp_path)

@@ -47,7 +47,7 @@ def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tm
     assert only_first["splats"]["still_db"] == pytest.approx(first["splats"]["still_db"], abs=0.01)
 
 
-def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
+def test_movers_of_the_plates_are_static_in_the_freeze(shot):
     """At a width of 320 the patch moves by up to 7 pixels per frame in the plates, but not in the frozen frames."""
     clip = open_clip(shot.root, width=320, develop=False)
     t_star = clip.frames[8]
@@ -121,7 +121,7 @@ def test_costs_are_those_of_the_later_half():
     assert (summary["first"], summary["median"], summary["least"], summary["most"]) == (9.0, 2.0, 1.0, 3.0)
 
 
-def test_means_and_gains_are_told_by_region():
+def test_means_and_gains_are_reported_by_region():
     def pose(splats: float, withheld: float, delivered: float, moving: float | None) -> dict:
         values = splats, splats + 1, withheld, delivered
         regions = {
@@ -145,7 +145,7 @@ def test_means_and_gains_are_told_by_region():
     json.dumps(mean)
 
 
-def test_how_much_of_a_small_mover_is_there_is_told_of_all_poses_and_of_the_worst():
+def test_recall_of_small_movers_is_reported_overall_and_for_the_worst_pose():
     def pose(found: int, should: int) -> dict:
         return {detail_truth.RECALLED: {v: {"arm": [found, should]} for v in detail_truth.VARIANTS}}
 

@@ -114,7 +114,7 @@ def report(results):
     return results / "report"
 
 
-def test_a_record_comes_back_as_it_went(results):
+def test_record_round_trips(results):
     path = next(results.glob("*.json"))
     record = load_record(path)
     save_record(results / "copy", record)
@@ -177,7 +177,7 @@ def test_every_table_has_a_row_of_what_is_delivered(results):
     assert cost["auto (ours), plate detail"][moving] == "–" != cost["auto (ours)"][moving]
 
 
-def test_an_ablation_is_held_against_splats_alone(results, tmp_path):
+def test_ablation_is_compared_with_splats_only(results, tmp_path):
     record = load_record(next(results.glob("*auto*.json")))
     record.pictures, record.two_instants, record.detailed[DELIVERED].pictures = [], [], []
     save_record(tmp_path, record)
@@ -230,7 +230,7 @@ def test_no_record_no_report(tmp_path):
         write_report(tmp_path, tmp_path / "report")
 
 
-def test_plots_strips_and_pictures_are_there(report):
+def test_report_contains_plots_strips_and_pictures(report):
     names = {p.name for p in report.glob("*.png")}
     assert {f"synthetic_{cost}.png" for cost in ("seconds", "frame_ms", "megabytes")} <= names
     for scene in ("room-3-exact", "ground-1-exact"):

@@ -55,14 +55,14 @@ def test_a_pixel_is_recalled_if_near_the_truth_and_nearer_than_to_what_is_behind
     assert recalled(close, truth, truth.lerp(behind, 0.5), mask)[0] == 0
 
 
-def test_only_things_with_a_background_are_recalled(apple):
+def test_recall_needs_a_known_background(apple):
     truth, behind, mask = apple
     regions = {"swinging": mask, "hair": mask}
     assert recall_of({"swinging": behind}, truth, truth, regions) == {"swinging": [15, 15]}
     assert recall_of({}, truth, truth, regions) == {}
 
 
-def test_a_pane_is_opened_where_the_matte_says_so():
+def test_pane_is_counted_open_where_the_matte_marks_motion():
     pane = torch.zeros(8, 12, dtype=torch.bool)
     pane[:, :4] = True
     motion = torch.zeros(8, 12)
@@ -129,7 +129,7 @@ def test_the_report_tells_of_glass_and_small_movers(tmp_path):
     ]
 
 
-def test_other_scenes_have_no_such_tables():
+def test_scenes_without_hard_objects_have_no_object_tables():
     rows = record("auto", "support", [[1, 1]], 0.1)
     for row in rows.rows:
         row.recalled, row.opened, row.regions = {}, {}, {"whole": row.regions["whole"]}

@@ -98,7 +98,7 @@ def test_nothing_moves_outside_of_the_mask(masked):
     assert moving > 0
 
 
-def test_the_same_mask_elsewhere_is_the_same_solve_and_another_one_is_not(masked, tmp_path, tools):
+def test_solve_key_depends_on_mask_content_not_path(masked, tmp_path, tools):
     shot, _, mask = masked
     copy = Shot(shutil.copytree(shot.root, tmp_path / "copy.splannequin"))
     shutil.copytree(mask, tmp_path / "moved")
@@ -120,7 +120,7 @@ def test_a_solve_without_masks_leaves_none_behind(masked, tmp_path):
     assert not copy.mask(PEOPLE, 101).is_file() and given_masks(copy) == {} and masks_key(copy) == []
 
 
-def test_a_mask_that_went_missing_is_named(masked, tmp_path):
+def test_missing_mask_is_named(masked, tmp_path):
     copy = Shot(shutil.copytree(masked[0].root, tmp_path / "copy.splannequin"))
     copy.mask(PEOPLE, 104).unlink()
     with pytest.raises(JobError, match=r"000104\.png is damaged or missing"):

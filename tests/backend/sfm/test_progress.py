@@ -84,7 +84,7 @@ def test_the_estimate_is_of_all_that_is_left():
     assert heard.bar[-1] == pytest.approx(0.5)
 
 
-def test_cameras_are_whole_when_they_are_known_and_a_search_that_ends_there_is_found_later(again):
+def test_cameras_are_complete_before_the_motion_search(again):
     shot, model = again
     shutil.rmtree(shot.motion)
     shutil.rmtree(shot.solve)

@@ -35,7 +35,7 @@ def strategies(best, **changes):
     return found
 
 
-def test_frames_that_are_matched_widely_already_are_not_matched_so_again():
+def test_wide_matching_is_not_retried_twice():
     done = {"first", "features"}
     assert next_strategy(attempt("few"), {**REQUEST, "wide": True}, done).name == "lens"
     assert next_strategy(attempt("few"), REQUEST, done).name == "pairs"
@@ -70,14 +70,14 @@ def test_only_what_can_help_is_tried(best, expected):
     assert strategies(best) == expected
 
 
-def test_a_lens_that_was_chosen_gives_way_to_a_fisheye_s_alone():
+def test_chosen_lens_model_is_retried_only_as_fisheye():
     assert strategies(attempt("lens", 60), camera_model="OPENCV") == [("pairs", True)]
     bent = attempt("lens", 60, {**LENS, "doubt": "bent", "found_bend": -0.3})
     assert strategies(bent, camera_model="OPENCV") == [FISHEYE, ("pairs", True)]
     assert strategies(bent, camera_model="OPENCV_FISHEYE") == [("pairs", True)]
 
 
-def test_a_focal_length_that_the_file_names_is_the_first_thing_to_doubt_unless_one_was_given():
+def test_file_focal_length_is_doubted_first_unless_the_user_set_one():
     assert [name for name, *_ in strategies(attempt("few"), start_focal_px=700.0)][:2] == ["focal", "features"]
     assert strategies(attempt("few"), start_focal_px=700.0, focal_px=650.0) == strategies(attempt("few"))
     assert strategies(attempt("narrow"), start_focal_px=700.0) == []

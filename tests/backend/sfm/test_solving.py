@@ -133,7 +133,7 @@ def test_progress_names_the_stages_in_order(solved):
     assert all(0 <= done <= total for _, done, total in solved.report.steps)
 
 
-def test_a_solved_shot_is_left_alone(solved, tools):
+def test_solved_shot_is_not_solved_again(solved, tools):
     before = {p: p.stat().st_mtime_ns for p in solved.shot.root.rglob("*") if p.is_file()}
     report = tools.recorder()
     assert solve_all(solved.shot, SolveConfig(features=1500), report) == solved.result
@@ -301,7 +301,7 @@ def test_a_lens_that_no_camera_has_is_refused(focal, message):
     assert (fault.kind, fault.error.message, fault.error.exit_code) == ("lens", message, ExitCode.SOLVE)
 
 
-def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
+def test_diverging_lens_is_fixed_to_a_common_one_and_reported(tmp_path, tools):
     """A frontal wall is ambiguous: far through a long lens looks like near through a short one."""
     poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(10)]
     shot, report = imported(tmp_path, tools, poses), tools.recorder()
@@ -358,7 +358,7 @@ def test_cancelling_kills_the_worker_and_leaves_nothing_half_done(tmp_path, tool
     assert not list(shot.frames.glob("*.png"))
 
 
-def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, tools):
+def test_failed_worker_gives_a_readable_error(tmp_path, tools):
     (tmp_path / "request.json").write_text(json.dumps({"images": str(tmp_path)}))
     with pytest.raises(JobError, match="The camera solve broke off") as error:
         run_worker(tmp_path / "request.json", tmp_path / "log.txt", tools.recorder())
@@ -390,7 +390,7 @@ def test_a_worker_ends_with_its_parent(tmp_path):
     assert worker.wait(timeout=50) == 1
 
 
-def test_solving_before_importing_says_so(tmp_path, tools):
+def test_solving_before_import_is_refused_readably(tmp_path, tools):
     with pytest.raises(JobError, match="has no frames yet"):
         solve_shot(Shot.create(tmp_path / "a.splannequin"), SolveConfig(), tools.recorder())
 

@@ -187,7 +187,7 @@ def test_stillness_is_paid_in_photometric_loss_and_does_not_change_it():
     assert price(shifts(0.1), error=0.5 * ERROR) == pytest.approx(0.5 * price(shifts(0.1)))
 
 
-def test_the_price_of_one_gaussian_does_not_depend_on_how_many_are_open():
+def test_loss_per_gaussian_is_independent_of_the_open_count():
     many, few = shifts(0.1, 0.0, 0.0, 0.0), shifts(0.1)
     assert price(many, 4) == pytest.approx(price(few, 4))
     for deltas in (many, few):
@@ -203,7 +203,7 @@ def test_a_field_may_look_for_motion_before_it_has_to_pay():
     assert prices[2] == prices[3]
 
 
-def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
+def test_visible_gaussians_that_do_not_contribute_are_not_anchored():
     """Its Gaussian moved away: frames show that it is gone, so nothing pulls it back."""
     m = model([[1, 1, 0, 0, 0, 0]] * 2)
     m.hidden[0] = False
@@ -239,7 +239,7 @@ def test_hidden_is_out_of_the_frame_or_behind_what_is_seen():
 
 
 @pytest.mark.parametrize(("is_gone", "anchored"), [(True, False), (False, True)])
-def test_gone_and_covered_are_told_apart_by_a_render(is_gone, anchored):
+def test_render_distinguishes_vanished_from_occluded(is_gone, anchored):
     """A dot on a wall fades: in plain view, or behind a post in front of it. Only the covered dot is a guess."""
     from torch_backend.raster import rasterize
 
@@ -271,7 +271,7 @@ def test_gone_and_covered_are_told_apart_by_a_render(is_gone, anchored):
     assert bool(m.hidden[221, 1]) == anchored
 
 
-def test_detectors_against_gradients_made_by_hand():
+def test_detectors_match_hand_computed_gradients():
     K = torch.tensor([[10.0, 0, 16.0], [0, 20.0, 8.0], [0, 0, 1]])
     means = torch.tensor([[0.0, 0, 2]] * 4)
     # NDC gradient = pixel gradient * half the image size; pixel gradient = gradient of the mean * depth / focal length.
@@ -298,7 +298,7 @@ def test_detectors_against_gradients_made_by_hand():
         acted("gradient", straight)
 
 
-def test_the_signed_sum_agrees_with_the_rasterisers_own_norm():
+def test_signed_sum_matches_the_rasteriser_norm():
     """The mean's gradient across the line of sight is the screen gradient, up to the effect of the Gaussian's shape."""
     from torch_backend.raster import rasterize
 

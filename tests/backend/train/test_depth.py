@@ -153,7 +153,7 @@ def test_frames_without_a_usable_map_are_trained_without_in_one_sentence(swaying
     )
 
 
-def test_a_sequence_of_something_else_is_refused_and_so_is_one_without_a_usable_map(swaying, quiet, tmp_path):
+def test_unrelated_or_unusable_depth_sequence_is_refused(swaying, quiet, tmp_path):
     rng = np.random.default_rng(1)
     unrelated = write_depth(swaying, tmp_path / "other", lambda depth, n: rng.uniform(0.1, 1.0, depth.shape))
     broken = write_depth(swaying, tmp_path / "broken")

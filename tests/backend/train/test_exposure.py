@@ -41,7 +41,7 @@ def test_finds_a_drift():
         assert float(error.abs().mean()) < 0.01
 
 
-def test_a_place_that_is_told_exposes_as_the_time_does_to_the_bit():
+def test_exposure_by_place_equals_exposure_by_time():
     exposure, image = Exposure(torch.tensor([0.0, 0.3, 0.55, 1.0]), ExposureConfig()), torch.rand(4, 5, 3)
     with torch.no_grad():
         exposure.values.copy_(0.1 * torch.randn(exposure.values.shape))

@@ -98,7 +98,7 @@ def test_the_finished_run_stays_until_the_last_added_step(world, quiet, finished
     assert {name: (folder / name).read_bytes() for name in kept} == kept
 
 
-def test_an_extension_of_other_length_begins_anew_and_says_so(world, quiet, finished):
+def test_extension_of_a_different_length_restarts_with_a_note(world, quiet, finished):
     folder = finished("ext-other")
     with pytest.raises(Cancelled):
         train_shot(world.shot, more("ext-other"), quiet(cancel_at=("training", 0.5)))
@@ -127,7 +127,7 @@ def test_a_run_is_extended_again_and_again(world, quiet, finished):
     assert ("progress", "training", 1, 1, "already trained") in report.events
 
 
-def test_figures_that_a_kill_left_behind_are_made_up_for(world, quiet, finished):
+def test_figures_missing_after_a_kill_are_recomputed(world, quiet, finished):
     folder = finished("ext-figures")
     stale = (folder / "summary.json").read_bytes()
     train_shot(world.shot, more("ext-figures"), quiet())
@@ -231,7 +231,7 @@ def test_the_command_line_takes_it(world, quiet, finished, capsys):
     assert "no trained run 'ext-gone' to extend" in capsys.readouterr().out
 
 
-def test_the_steps_of_the_presets_are_what_blender_is_told():
+def test_preset_steps_match_those_in_blender():
     assert {name: preset().iterations for name, preset in PRESETS.items()} == PRESET_STEPS
     assert {name: preset().width for name, preset in PRESETS.items()} == contract.PRESET_WIDTHS
     assert tuple(sorted(hosts())) == contract.HOSTS

@@ -63,7 +63,7 @@ def test_smaller_presets_take_less_and_what_fits_an_hour_is_named():
     assert warning_of(3600.0, 1280, False, rows) is None
 
 
-def test_a_clip_on_which_a_smaller_preset_trains_on_the_same_pictures_is_told_so():
+def test_smaller_preset_with_equal_pictures_is_reported():
     rows = smaller_presets("final", (640, 480), 20_000, 4e-7)
     assert [row.width for row in rows] == [640, 320]
     hint = warning_of(9000.0, 640, False, rows)[1]

@@ -127,7 +127,7 @@ def test_where_the_mattes_say_that_nothing_moves_nothing_opens(tmp_path, quiet):
     assert load_run(world.shot, "still").model.field is None
 
 
-def test_published_hosts_do_not_heed_them(painted_world, quiet):
+def test_published_hosts_ignore_movers(painted_world, quiet):
     for changes in ({"method": "hexplane"}, {"host_config": "reference"}):
         assert trainer_of(painted_world, quiet, 0, **changes).movers is None
     assert trainer_of(painted_world, quiet, 0, method="static").movers is not None

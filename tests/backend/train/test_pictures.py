@@ -42,7 +42,7 @@ def final(on_card, **changes):
     return config_from_params(TrainParams(preset="final", **changes), on_card)
 
 
-def test_a_preset_has_a_cards_numbers_on_a_card_unless_others_are_asked_for():
+def test_final_preset_uses_gpu_numbers_unless_overridden():
     card, processor = final(True), final(False)
     assert (card.width, card.densify.budget, card.iterations, card.plates) == (1920, 1_000_000, 30_000, True)
     assert (processor.width, processor.densify.budget, processor.plates) == (0, 400_000, False)
@@ -59,7 +59,7 @@ def test_the_processors_runs_are_known_by_what_they_were_known_by_and_a_cards_co
         assert config_from_json(config_to_json(final(on_card))) == final(on_card)
 
 
-def test_a_card_is_given_the_sources_own_frames_in_any_order(shot, quiet):
+def test_gpu_training_reads_source_frames_in_any_order(shot, quiet):
     scene, plates = load_scene(shot), Plates(shot)
     assert scene.width == 64 and plates.width == 128
     report = quiet()
@@ -72,7 +72,7 @@ def test_a_card_is_given_the_sources_own_frames_in_any_order(shot, quiet):
     assert pictures_of(shot, scene, final(True, width=100), report).size == (100, 75)
 
 
-def test_working_frames_serve_where_no_more_is_asked_for_or_there(shot, quiet):
+def test_working_frames_are_used_if_large_enough_or_without_source(shot, quiet):
     scene, report = load_scene(shot), quiet()
     for config, size in (
         (final(False), (64, 48)),

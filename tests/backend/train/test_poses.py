@@ -44,7 +44,7 @@ def test_gradients_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(lambda x: corrected(viewmats, x), (values,))
 
 
-def test_the_gauge_holds_and_held_frames_follow_their_neighbours():
+def test_gauge_is_fixed_and_anchored_frames_follow_neighbours():
     poses = Poses([0.0, 0.2, 0.4, 0.8, 1.0], PosesConfig(), CPU)
     with torch.no_grad():
         poses.values[:] = torch.tensor([3.0, 100.0, 1.0, 2.0, 4.0])[:, None]

@@ -61,9 +61,7 @@ def test_kernels_that_compute_something_else_are_found(changed_adam, monkeypatch
         ("plane_penalty", "const float gap", "constfloat gap", "a kernel does not build or run on it ("),
     ],
 )
-def test_where_only_the_fields_kernels_are_wrong_torch_stands_in_for_them(
-    kernel, old, new, wrong, monkeypatch, quiet, capfd
-):
+def test_torch_replaces_wrong_field_kernels(kernel, old, new, wrong, monkeypatch, quiet, capfd):
     source = planes_cuda.source
     assert old in source(kernel, 16)
 

@@ -32,7 +32,7 @@ def loss_of(movers_loss, image, target, dssim, ignored, frame, progress):
     return movers_loss.loss(image, target, dssim, ignored, movers_loss.movers_at(frame, progress))
 
 
-def test_it_is_the_loss_of_what_stands_still_and_the_loss_of_soft_movers(pictures):
+def test_loss_is_the_static_loss_plus_softened_movers(pictures):
     image, target, movers = pictures
     movers_loss = SoftenedMovers(movers, W, span=(0.2, 0.5), block=16.0)
     assert movers_loss.block == 4 and movers_loss.margin == 1
@@ -64,7 +64,7 @@ def test_only_the_mean_of_what_moves_counts(pictures):
         )
 
 
-def test_a_hand_that_is_far_from_where_it_should_be_is_pulled_there(pictures):
+def test_softened_loss_attracts_a_distant_hand(pictures):
     """A bar of 2 px is 2.5 px from its place; at full resolution, small shifts do not change its error."""
     _, _, movers = pictures
     movers[0, :, 60:140] = True

@@ -159,7 +159,7 @@ def test_what_was_in_order_stays_as_it_was_row_by_row(begin):
     assert repair(model, trainer.optimizer, densifier, trainer.soundness.memory, 30) == ""
 
 
-def test_a_gradient_of_its_own_costs_a_gaussian_and_no_more(begin):
+def test_non_finite_gradient_removes_only_its_gaussian(begin):
     trainer = begin("static")
     count = len(trainer.model.gaussians)
     trainer.model.gaussians.params["means"].register_hook(lambda g: g.index_fill(0, torch.tensor([4]), NAN))
@@ -235,7 +235,7 @@ def test_a_field_that_throws_gaussians_out_of_their_place_is_put_back(begin, hos
 
 
 @pytest.mark.parametrize(("share", "times", "said"), [(0.2, 7.0, 1), (0.2, 5.0, 0), (0.05, 7.0, 0)])
-def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(begin, share, times, said):
+def test_diverged_field_is_restored_between_two_checks(begin, share, times, said):
     """The bound is relative to the extent of moving Gaussians; the extent of the whole scene is many times larger."""
     trainer = begin("hexplane", 30)
     means = trainer.model.gaussians.params["means"].detach()[trainer.model.open_rows()]
@@ -267,7 +267,7 @@ def bound_between(trainer: Trainer, count: int) -> torch.Tensor:
     return far >= first
 
 
-def test_who_is_thrown_out_of_its_place_is_dropped_and_nobody_else(begin):
+def test_only_displaced_outliers_are_dropped(begin):
     trainer = begin("hexplane", 30)
     model, memory = trainer.model, trainer.soundness.memory
     assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 0
@@ -284,7 +284,7 @@ def test_who_is_thrown_out_of_its_place_is_dropped_and_nobody_else(begin):
 
 
 @pytest.mark.parametrize("method", ["auto", "hexplane"])
-def test_a_round_of_growth_drops_what_is_thrown_behind_a_gate_alone(begin, method):
+def test_growth_drops_outliers_only_with_a_gate(begin, method):
     """Published hosts without a gate stay as published."""
     trainer = begin(method, 30)
     if method == "auto":
@@ -301,7 +301,7 @@ def test_a_round_of_growth_drops_what_is_thrown_behind_a_gate_alone(begin, metho
         assert torch.equal(trainer.model.gaussians.params["means"], kept)
 
 
-def test_a_small_thing_may_move_by_many_times_its_size(begin):
+def test_small_gaussian_may_move_by_many_times_its_size(begin):
     trainer = begin("hexplane", 30)
     means = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)) * 0.02
     trainer.soundness.memory.keep(trainer.model.field, means)
@@ -323,7 +323,7 @@ def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin
     assert [0.5 * lr, 0.5 * lr * trainer.config.field.lr_end] in rates
 
 
-def test_a_resumed_run_drops_who_is_thrown_as_an_unbroken_one_does(begin, tmp_path):
+def test_resumed_run_drops_the_same_outliers(begin, tmp_path):
     """Without a stored bound it would drop nothing until its next inspection, and a round of growth may come first."""
     trainer = begin("hexplane", 30)
     trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
@@ -361,7 +361,7 @@ def test_a_field_that_joins_sooner_starts_at_the_rates_of_a_third_of_the_run():
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh0", "shN"])
-def test_a_hasty_step_of_one_attribute_is_trained_away(begin, name):
+def test_large_step_of_one_attribute_recovers(begin, name):
     trainer = begin("static", 20)
     loss = float(torch.tensor(go_on(trainer, 10)).mean())
     normal = trainer._schedule_rates
@@ -411,7 +411,7 @@ def test_a_step_that_memory_did_not_suffice_for_opens_the_gate_once(begin):
     assert [group.get("name") for group in trainer.optimizer.param_groups] == groups
 
 
-def test_a_field_that_memory_did_not_suffice_for_is_made_anew(begin, monkeypatch):
+def test_field_is_rebuilt_after_out_of_memory(begin, monkeypatch):
     module, restarts = sys.modules[schedule_events.__module__], []
 
     def short(*arguments):

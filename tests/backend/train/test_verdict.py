@@ -31,14 +31,14 @@ def lost_at(first: int, last: int, row: int, column: int, share: float = 0.8) ->
     return cells
 
 
-def test_people_who_hold_still_are_good_and_their_sway_is_told_in_pixels():
+def test_still_people_are_good_with_sway_in_pixels():
     verdict = judge(figures())
     assert verdict.lines() == ["Good. It shows all of the clip.", "What moves sways by up to 13 of 640 pixels."]
     assert verdict.where == []
     assert judge(figures(width=1920)).sentences[-1] == "What moves sways by up to 40 of 1920 pixels."
 
 
-def test_a_still_world_is_told_as_one():
+def test_static_world_is_reported():
     verdict = judge(figures(sway=0.0039, farthest=0.0045))
     assert verdict.word == "good" and "Nothing moves in it." in verdict.sentences
     assert verdict.advice == ["Any frame will do as t*."]
@@ -53,7 +53,7 @@ def test_a_run_that_learnt_no_motion_is_not_taken_for_a_still_world():
     assert judge(figures(matte_moving=0.087)).word == "good", "what moves was learnt"
 
 
-def test_a_walker_is_told_with_frames_place_and_what_to_do():
+def test_walker_is_reported_with_frames_place_and_advice():
     travel = lost_at(10, 40, 1, 1, 0.22)
     verdict = judge(figures(unexplained=lost_at(10, 31, 3, 0), travel=travel, far=0.02, farthest=0.22))
     assert verdict.word == "fair"
@@ -70,14 +70,14 @@ def test_a_walker_is_told_with_frames_place_and_what_to_do():
     assert followed.instants == [] and not any("t*" in line for line in followed.advice), "shown, it stands at any t*"
 
 
-def test_one_who_walks_and_is_followed_is_told_too():
+def test_tracked_walker_is_reported():
     verdict = judge(figures(travel=lost_at(1, 74, 2, 2, 0.22), far=0.02, farthest=0.22))
     assert verdict.word == "fair" and "141 of 640" in verdict.sentences[-1] and "motion matte" in verdict.advice[0]
     spot = judge(figures(travel=lost_at(1, 74, 2, 2, 0.22), far=0.0005, farthest=0.034))
     assert spot.word == "good", "a few far pixels, as in `hall`, are nobody who walks"
 
 
-def test_what_holds_nowhere_is_poor_and_so_is_what_does_not_show_the_clip():
+def test_inconsistent_or_unlike_run_is_poor():
     verdict = judge(figures(unexplained=lost_at(1, 74, 1, 1)))
     assert verdict.word == "poor" and "frames 1 to 73, middle" in verdict.sentences[0]
     assert "Somebody walks through, or the camera is wrong" in verdict.advice[0]
@@ -143,7 +143,7 @@ def walk_through(shot):
         write_png(path, pixels)
 
 
-def test_a_run_tells_how_far_things_travel(trained):
+def test_run_reports_travel_distance(trained):
     """The small world's patch sways by 0.4 units at depth 3.2, which is more than people who hold still."""
     world, summary = trained
     places = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
@@ -157,7 +157,7 @@ def test_a_run_tells_how_far_things_travel(trained):
 
 
 @pytest.mark.parametrize("holdout", [8, 0])
-def test_somebody_who_walks_through_is_told(tmp_path, quiet, holdout):
+def test_person_walking_through_is_reported(tmp_path, quiet, holdout):
     world = sys.modules[quiet.__module__].build_world(tmp_path)
     params = TrainParams(iterations=200, max_gaussians=1500, holdout=holdout)
     walk_through(world.shot)

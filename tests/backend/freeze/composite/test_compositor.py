@@ -264,7 +264,7 @@ def test_a_still_world_is_the_plate(still_world):
 
 
 @pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (9, 4)])
-def test_away_from_what_moves_a_frame_is_the_plate(world, composited, frame, t_star):
+def test_static_pixels_equal_the_plate(world, composited, frame, t_star):
     where = ~dilate(world.seen_at(frame)[1] | world.truth(world.output(frame, t_star))[1], 24)
     assert where.mean() > 0.5
     assert_is_plate(composited(frame, t_star), world.plates().linear(frame), where)
@@ -310,14 +310,14 @@ def replace_pose(output, shift):
     return replace(output, viewmat=viewmat, exposed_like=output.t_star)
 
 
-def test_the_plate_of_the_instant_is_its_own_frame(world, composited):
+def test_frame_at_t_star_equals_its_plate(world, composited):
     for frame in (4, 11):
         assert_is_plate(composited(frame, frame), world.plates().linear(frame), np.ones((H, W), bool))
         assert composited(frame, frame).motion.numpy()[~dilate(~world.seen_at(frame)[1], 3)].min() > 0.9
 
 
 @pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (10, 4)])
-def test_the_plate_may_stand_where_the_motion_matte_is_black(world, composited, frame, t_star):
+def test_plate_may_be_used_where_the_motion_matte_is_black(world, composited, frame, t_star):
     """Where the board has left its place by t*, the matte must be white: the plate would show the board twice."""
     result = composited(frame, t_star)
     gone = world.seen_at(frame)[1] & ~world.truth(world.output(frame, t_star))[1]
@@ -329,7 +329,7 @@ def test_the_plate_may_stand_where_the_motion_matte_is_black(world, composited, 
     assert result.motion.mean() < 0.6, "the room stays as it was"
 
 
-def test_stripes_of_what_sways_come_from_other_plates_moved_as_the_model_moves_it(world):
+def test_swaying_texture_comes_from_warped_neighbour_plates(world):
     """At the end of its path the board moves by 2 pixels per frame, which is half a stripe."""
     output = world.output(12, 13)
     result = world.make(output, withheld=[13])
@@ -339,7 +339,7 @@ def test_stripes_of_what_sways_come_from_other_plates_moved_as_the_model_moves_i
     assert set(np.unique(result.source.numpy()[inner])) <= {10.0, 11.0, 12.0}
 
 
-def test_far_from_plate_t_star_a_wrong_depth_is_made_up_for_by_the_own_plate(tmp_path, quiet, monkeypatch):
+def test_frame_plate_compensates_wrong_depth_far_from_t_star(tmp_path, quiet, monkeypatch):
     """Between the ends of the path, a depth error of 3 % shifts the stripes of plate t* by a quarter."""
     monkeypatch.setitem(globals(), "SWAY", 0.003)
     world = build(tmp_path, quiet())
@@ -357,7 +357,7 @@ def test_far_from_plate_t_star_a_wrong_depth_is_made_up_for_by_the_own_plate(tmp
     assert rms_error(both.color, truth, inner) < 0.8 * rms_error(one.color, truth, inner)
 
 
-def test_a_masked_logo_is_in_no_frozen_frame_and_what_is_behind_it_comes_from_other_plates(tmp_path, quiet):
+def test_masked_logo_is_filled_from_other_plates(tmp_path, quiet):
     logo = np.zeros((H, W), bool)
     logo[150:170, 40:70] = True
     world, plain = build(tmp_path, quiet(), still=True, logo=logo), tmp_path / "plain"
@@ -395,7 +395,7 @@ def test_withheld_plates_are_not_used(tmp_path, quiet):
     assert not torch.equal(again.linear, used.linear), "else the test tests nothing"
 
 
-def test_without_its_own_plate_a_frame_is_made_of_others(still_world):
+def test_withheld_plate_is_replaced_by_other_plates(still_world):
     output = still_world.output(8, 11)
     result = still_world.make(output, withheld=[8])
     truth, _ = still_world.truth(output)
@@ -405,7 +405,7 @@ def test_without_its_own_plate_a_frame_is_made_of_others(still_world):
 
 
 @pytest.mark.parametrize(("shift", "nearest"), [((0.02, 0.01, 0.05), 9), ((0.2, 0.0, 0.0), 6)])
-def test_a_camera_of_ones_own_looks_into_the_nearest_plate(world, shift, nearest):
+def test_custom_camera_uses_the_nearest_plate(world, shift, nearest):
     output = replace_pose(world.output(9, 10), shift)
     result = world.make(output)
     distances = (world.scene.viewmats[:, :3, 3] - output.viewmat[:3, 3]).norm(dim=1)
@@ -419,7 +419,7 @@ def test_a_camera_of_ones_own_looks_into_the_nearest_plate(world, shift, nearest
     assert bool(torch.isfinite(result.linear).all()) and result.plate.mean() > 0.8
 
 
-def test_a_camera_of_ones_own_at_a_pose_of_the_clip_is_that_plate(still_world):
+def test_custom_camera_at_a_clip_pose_equals_that_plate(still_world):
     output = replace(still_world.output(9, 4), frame=1001, exposed_like=4.0)
     result = still_world.make(output)
     assert result.primary == 9
@@ -477,7 +477,7 @@ def test_overscan_goes_on_around_the_same_frame(world, composited):
     )
 
 
-def test_a_frame_does_not_depend_on_those_made_before(world, composited):
+def test_frame_is_independent_of_earlier_frames(world, composited):
     first = {key: composited(*key) for key in ((3, 11), (9, 4))}
     for key, want in first.items():
         single = world.make(world.output(*key))
@@ -490,7 +490,7 @@ def test_a_frame_does_not_depend_on_those_made_before(world, composited):
 
 
 @pytest.mark.parametrize("case", ["own", "wide", "withheld", "elsewhere"])
-def test_a_frame_made_some_rows_at_a_time_is_the_same(world, monkeypatch, case):
+def test_frame_is_identical_when_computed_in_row_bands(world, monkeypatch, case):
     output = world.output(9, 4)
     if case == "elsewhere":
         output = replace_pose(output, [0.1, -0.2, 0.3])
@@ -506,7 +506,7 @@ def test_a_frame_made_some_rows_at_a_time_is_the_same(world, monkeypatch, case):
             np.testing.assert_allclose(a, b, atol=1e-4, err_msg=name)  # half floats near 0.5 have errors of 2.4e-4
 
 
-def test_bars_beside_the_picture_are_the_frames_own_plate_s(world):
+def test_bars_come_from_the_plate_of_the_frame(world):
     """Bars are not part of the scene, so neither splats nor other plates show anything there."""
     output, bars = world.output(4, 7), np.zeros((H, W), bool)
     bars[:, : W // 2] = True  # also covers the board, whose pixels must come from t*

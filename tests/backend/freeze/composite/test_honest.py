@@ -71,7 +71,7 @@ def test_a_matte_that_ends_short_of_what_moves_leaves_nothing_of_it(world):
     assert stale_board_share(world, make(world, short, **BLIND)) > 0.1, "else there is nothing to mend"
 
 
-def test_what_is_held_still_and_was_elsewhere_at_t_star_is_not_shown(world):
+def test_object_that_moved_since_t_star_is_not_shown(world):
     """Nobody moves for a second, so mattes are empty; plate t* shows the wall, and so does the frozen frame."""
     still = {frame: np.zeros((H, W), bool) for frame in range(FRAME - 2, FRAME + 3)}
     composited = make(world, still)
@@ -104,7 +104,7 @@ def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
     assert without_evidence.matte.numpy()[gone].min() > 0.99, "else something else says so"
 
 
-def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(world):
+def test_plate_is_kept_where_the_model_contradicts_plate_t_star(world):
     """The model has a wrong colour in a spot of the wall at all times, which is not motion."""
     spot = world.run.model.gaussians.params["means"][:, :2]
     wrong = (spot - torch.tensor([-2.2, 1.7])).norm(dim=1) < 0.4

@@ -92,7 +92,7 @@ def test_another_overscan_makes_the_frames_stale_and_none_leaves_no_map(trained,
     assert json.loads((folder / "take.json").read_text())["redistort"] == ""
 
 
-def test_a_camera_of_ones_own_has_overscan_in_percent_and_no_map(trained, lens, quiet, tmp_path):
+def test_custom_camera_has_percent_overscan_and_no_map(trained, lens, quiet, tmp_path):
     world, _ = trained
     pose = world.viewmats[7].flatten().tolist()
     path = CameraPath(64, 48, [CameraFrame(1, pose, [90.0, 90.0, 32.0, 24.0], "blender")])

@@ -178,7 +178,7 @@ def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
         assert bool((torch.sigmoid(moved["opacity_logits"][added]) < 1e-6).all())
 
 
-def test_floaters_are_hidden_and_nothing_that_stands_still(trained):
+def test_floaters_are_hidden_and_static_gaussians_kept(trained):
     """A part of the moving Gaussians has a colour that plate t* does not show there."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -248,7 +248,7 @@ def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(tra
     assert ours[0] > was_moving - 0.1 and ours[0] > static[0] + 1.0 and bool(stays.any())
 
 
-def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(trained):
+def test_nearer_plates_are_used_even_where_the_object_moves(trained):
     """The wall is wrongly opened at t*, and mattes call everything moving, so no static pixel contradicts it."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -261,7 +261,7 @@ def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(train
     assert closed[0] == 0.0 and closed[1] > 0.8
 
 
-def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
+def test_far_moving_gaussians_stay_open_without_a_matte(trained):
     """`doubted` closes Gaussians that sway outside of moving mattes, but never those that moved far."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -277,7 +277,7 @@ def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
     assert left[1e9, 1.0] > 1.2 * left[1e9, 1e9]
 
 
-def test_what_is_seen_from_afar(trained):
+def test_undersampled_gaussians_are_found(trained):
     """A Gaussian is undersampled if some frame that saw it was less than half as far away."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -294,7 +294,7 @@ def test_what_is_seen_from_afar(trained):
     assert undersampled(run, scene, means, scene.frames[first], 20.0).tolist() == [False] * 4
 
 
-def test_of_what_t_star_sees_from_afar_nothing_is_learnt_where_it_moves(trained):
+def test_undersampled_moving_gaussians_are_not_trained(trained):
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, rows, mattes = field(run, scene), run.model.open_rows(), motion_mattes(world.shot)
@@ -309,7 +309,7 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_where_it_moves(trained)
     assert float(changed[frozen.motion < 0.5].float().mean()) > 0.9, "others show it as it is, too"
 
 
-def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(trained):
+def test_undersampled_closed_gaussians_are_not_trained(trained):
     """The Gaussians are closed, and one frame's matte calls them moving; other frames must not teach those seen from
     afar."""
     world, _ = trained
@@ -370,7 +370,7 @@ def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):
     assert moving > was_moving + 6.0 and still > was_still - 0.5
 
 
-def test_what_has_gone_in_the_other_plates_is_not_erased(trained, developed_world):
+def test_object_missing_in_neighbour_plates_is_not_erased(trained, developed_world):
     """In plates far from t* the patch is elsewhere, and its place at t* shows the wall."""
     world, _ = trained
     run, scene, frozen, _ = developed_world
@@ -390,7 +390,7 @@ def test_a_kept_instant_is_read_back_to_the_bit(trained, developed_world):
     assert load_developed(world.shot, run, 106, frozen) is None
 
 
-def test_where_still_pixels_gain_too_little_what_moves_is_developed_alone(trained, developed_world):
+def test_only_movers_are_developed_if_static_pixels_gain_little(trained, developed_world):
     world, _ = trained
     run, scene, frozen, _ = developed_world
     config, path = DevelopConfig(steps=150, gain=99.0), developed_path(run, 106)
@@ -417,7 +417,7 @@ def plate_error(run, scene, shot, frozen, frame):
     return float((shown(run, scene, frozen, frame) - plate).square().mean(-1)[moves].mean())
 
 
-def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_neighbours_bear(shot_copy, monkeypatch):
+def test_evidence_of_plate_t_star_is_weighted_by_neighbour_plates(shot_copy, monkeypatch):
     """In the neighbouring plates the moving object has another colour."""
     shot, run, scene, frozen = shot_copy
     path = scene.image_path(scene.frames.index(T_STAR))
@@ -444,7 +444,7 @@ def shot_copy(trained, tmp_path):
     return shot, run, scene, field(run, scene)
 
 
-def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(shot_copy):
+def test_damaged_or_mismatched_instant_is_recomputed(shot_copy):
     shot, run, scene, frozen = shot_copy
     make = lambda: developed(shot, run, scene, T_STAR, frozen, SHORT)  # noqa: E731
     first, path = make(), developed_path(run, T_STAR)
@@ -464,7 +464,7 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(shot_copy):
     assert again is not None and same(again, first)
 
 
-def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(shot_copy):
+def test_held_out_instant_is_trained_from_adjacent_plates(shot_copy):
     shot, run, scene, _ = shot_copy
     frame, config = 109, DevelopConfig(steps=100, gain=-99.0)
     assert frame not in run.train_frames
@@ -499,7 +499,7 @@ def test_cancelling_leaves_nothing(shot_copy, quiet):
     assert len(report.events) == 1 + math.ceil(0.01 * config_for(run).steps), "it stops at once"
 
 
-def test_where_it_cannot_be_kept_the_take_is_made_all_the_same(shot_copy, trained, developed_world, quiet):
+def test_take_is_finished_even_if_the_instant_cannot_be_stored(shot_copy, trained, developed_world, quiet):
     shot, run, _, _ = shot_copy
     world, _ = trained
     (run.folder / "developed").write_text("in the way")
@@ -518,7 +518,7 @@ def test_where_it_cannot_be_kept_the_take_is_made_all_the_same(shot_copy, traine
     np.testing.assert_array_equal(*pictures)
 
 
-def test_frames_are_made_anew_when_developing_is_switched(trained, developed_world, quiet):
+def test_switching_develop_rerenders_frames(trained, developed_world, quiet):
     world, _ = trained
     keys, facts, frame = [], [], world.shot.take("switched") / "000105.exr"
     for wanted in ("off", "off", "on", "on", "off"):
@@ -529,7 +529,7 @@ def test_frames_are_made_anew_when_developing_is_switched(trained, developed_wor
     assert keys[0] == keys[1] != keys[2] == keys[3] and keys[4][0] == keys[0][0] != keys[2][0]
 
 
-def test_of_keyed_instants_those_of_trained_frames_are_developed_and_of_too_many_none(trained, developed_world):
+def test_keyed_instants_of_trained_frames_are_developed_up_to_a_limit(trained, developed_world):
     world, _ = trained
     run, scene = developed_world[:2]
     trained_on, held_out_frames = run.train_frames, sorted({*scene.frames} - {*run.train_frames})

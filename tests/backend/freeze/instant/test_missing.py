@@ -51,7 +51,7 @@ def test_nothing_is_added_where(plate, scene, matte):
     assert not bool((missing_between(plate, scene, matte)[0] > 0.5).any())
 
 
-def test_a_stray_splat_beside_a_hand_does_not_pull_it_near():
+def test_stray_splat_does_not_change_the_depth_of_a_hand():
     """The depth is the median over the outline, most of which belongs to the arm."""
     scene = [(ARM_AT, ARM), (np.s_[64:68, 44:48], 0.5)]
     missing, inverse = missing_between([(ARM_AT, ARM), (HAND_AT, ARM), (np.s_[64:68, 44:48], ARM)], scene)

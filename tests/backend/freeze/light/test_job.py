@@ -198,7 +198,7 @@ def test_the_panorama_is_the_scenes_and_says_what_was_filled(take, quiet):
     assert facts.filled == result["filled"] and facts.position == POINT.tolist()
 
 
-def test_it_is_made_once_and_anew_for_another_point_or_take(take, quiet):
+def test_light_is_recomputed_for_a_new_point_or_take(take, quiet):
     world, folder = take
     first = make_light(world.shot, params(), quiet(), SMALL)
     before = read(first["light"])
@@ -216,7 +216,7 @@ def test_it_is_made_once_and_anew_for_another_point_or_take(take, quiet):
     folder.facts.write_text(json.dumps(facts), encoding="utf-8")
 
 
-def test_a_shot_that_was_moved_since_is_seen_where_it_stands_now(take, quiet, tmp_path):
+def test_light_uses_the_current_shot_placement(take, quiet, tmp_path):
     """The same point of the frozen scene, after the scene was rotated by a quarter turn and scaled by two."""
     world, folder = take
     still = read(make_light(world.shot, params(), quiet(), SMALL)["light"])
@@ -248,14 +248,14 @@ def test_the_light_is_exposed_as_at_the_instant(trained_copy, quiet):
     assert not [event for event in report.events if event[0] == "warning"]
 
 
-def test_a_run_that_is_gone_costs_the_exposure_and_says_so(take, quiet):
+def test_missing_run_drops_exposure_with_a_warning(take, quiet):
     world, _ = take
     report = quiet()
     make_light(world.shot, params(position="1.5,-0.5,0.76"), report, SMALL)
     assert [event for event in report.events if event[0] == "warning"]
 
 
-def test_what_cannot_be_made_is_a_sentence(take, quiet):
+def test_uncreatable_paths_give_a_readable_error(take, quiet):
     world, folder = take
     with pytest.raises(JobError, match="no finished take"):
         make_light(world.shot, params(take="nowhere"), quiet())

@@ -42,7 +42,7 @@ def test_faces_make_one_picture_without_seams():
     np.testing.assert_allclose(picture, smooth(true_directions(WIDTH)), atol=2e-3)
 
 
-def test_a_cap_is_filled_smoothly_and_its_share_is_told():
+def test_filled_cap_is_smooth_and_its_share_reported():
     along = true_directions(256)
     known = smooth(along)
     known[along[..., 0] < 0.5] = 0.0  # unknown in three quarters of the sphere, including both poles and the seam

@@ -57,7 +57,7 @@ def error(world, take, number, t, where):
     return float(np.square(frame_of(world, take, number).rgba[..., :3] - truth)[where].mean())
 
 
-def test_a_thing_stands_as_another_instant_has_it(world, quiet):
+def test_object_can_come_from_a_second_instant(world, quiet):
     result = combine(world.shot, CombineParams(take="both", base="early", things="patch=late"), quiet())
     assert result["frames"] == LAST - FIRST + 1 and result["combined"]["things"] == {"patch": "late"}
     everywhere = np.ones((48, 64), bool)
@@ -81,7 +81,7 @@ def test_a_thing_stands_as_another_instant_has_it(world, quiet):
     assert np.abs(preview - late_preview)[covered(world, 107, 113)].mean() < 3
 
 
-def test_a_thing_lives_on_while_all_else_stands(world, quiet):
+def test_live_object_moves_while_the_rest_is_frozen(world, quiet):
     combine(world.shot, CombineParams(take="alive", base="early", things="patch=live"), quiet())
     for n in (104, 109, 111):
         frame, now = frame_of(world, "alive", n), covered(world, n, n)
@@ -90,7 +90,7 @@ def test_a_thing_lives_on_while_all_else_stands(world, quiet):
         assert (frame.detail.source[inside] == n).mean() > 0.95 and (frame.detail.plate[inside] > 0.95).mean() > 0.95
 
 
-def test_what_is_there_stays_and_what_changed_is_made_again(world, quiet):
+def test_unchanged_frames_are_kept_and_changed_ones_recomputed(world, quiet):
     params = CombineParams(take="again", base="early", things="patch=late")
     combine(world.shot, params, quiet())
     folder = TakeFolder(world.shot.take("again"))
@@ -129,7 +129,7 @@ def test_what_cannot_be_combined_is_said(world, quiet):
     refused("has no matte", base="wide")
 
 
-def test_a_mask_takes_one_layer_or_the_other():
+def test_mask_selects_between_two_layers():
     base = frame_like(1.0)
     result = combined(base, frame_like(3.0), np.float32([[0.0, 0.25], [0.75, 1.0]]))
     np.testing.assert_allclose(result.rgba[..., 0], [[1.0, 1.5], [2.5, 3.0]])
@@ -156,7 +156,7 @@ class Lone(Source):
         return self.kept
 
 
-def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
+def test_live_matte_includes_touching_pixels_with_soft_borders():
     matte, motion = np.zeros((40, 60), np.float32), np.zeros((40, 60), np.float32)
     matte[10:20, 10:20], motion[15:30, 18:25], motion[5:10, 50:55] = 1.0, 1.0, 1.0
     alive = with_motion(matte, np.zeros_like(matte), motion)

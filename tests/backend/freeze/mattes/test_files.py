@@ -25,7 +25,7 @@ def test_a_matte_is_read_back(tmp_path, suffix, tolerance):
     assert suffix not in suffixes_beside(suffix) and suffixes_beside(suffix)
 
 
-def test_a_file_that_is_cut_off_is_not_current(tmp_path):
+def test_truncated_matte_file_is_not_current(tmp_path):
     path = tmp_path / "000001.exr"
     write_matte(path, np.ones((40, 40), np.float32), (0, 0), "key")
     path.write_bytes(path.read_bytes()[:-30])

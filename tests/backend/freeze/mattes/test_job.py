@@ -69,7 +69,7 @@ def test_one_lasso_is_a_matte_at_every_pose(take, quiet):
     assert [lasso.name for lasso in stored_lassos(folder, 64, 48)] == ["patch"]
 
 
-def test_what_is_right_stays_and_what_is_stale_is_made_again(take, quiet):
+def test_current_mattes_are_kept_and_stale_ones_recomputed(take, quiet):
     world, folder, lassos = take
     make_mattes(world.shot, lassos(patch(world)), quiet())
     first = folder.matte_frames("patch") / "000106.exr"
@@ -86,7 +86,7 @@ def test_what_is_right_stays_and_what_is_stale_is_made_again(take, quiet):
     assert sorted(result["made"]) == ["corner", "patch"]
 
 
-def test_a_matte_is_removed_and_the_other_stays(take, quiet):
+def test_removing_one_matte_keeps_the_second(take, quiet):
     world, folder, lassos = take
     make_mattes(world.shot, lassos(patch(world), CORNER), quiet())
     result = make_mattes(world.shot, MatteParams(take=folder.root.name, remove="corner"), quiet())
@@ -131,7 +131,7 @@ def test_wrong_lassos_are_sentences(take, quiet, row, word):
         make_mattes(world.shot, lassos(CORNER, {**CORNER, **row}), quiet())
 
 
-def test_a_take_that_is_not_there_and_no_lassos_are_sentences(take, quiet):
+def test_missing_take_or_lassos_give_readable_errors(take, quiet):
     world, folder, _ = take
     with pytest.raises(JobError, match="no finished take"):
         make_mattes(world.shot, MatteParams(take="nowhere"), quiet())

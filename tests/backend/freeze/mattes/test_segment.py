@@ -42,7 +42,7 @@ def test_a_sloppy_lasso_finds_the_outline_by_colour():
     assert overlap(segment_lasso(picture, depth, lasso), mask) > 0.98 > 0.97 > drawn
 
 
-def test_depth_tells_apart_what_has_one_colour():
+def test_depth_separates_objects_of_one_colour():
     mask = disc((160, 220), (110, 80), 45)
     picture = painted(mask, (110, 110, 110), (110, 110, 110))
     lasso = ring((110, 80), 45, 4.0)
@@ -51,7 +51,7 @@ def test_depth_tells_apart_what_has_one_colour():
     assert overlap(segment_lasso(picture, depth, lasso), mask) > max(0.965, alike)
 
 
-def test_a_matte_of_splats_that_is_off_moves_to_the_edge_of_the_picture():
+def test_shifted_splat_matte_is_aligned_to_picture_edges():
     mask, shifted = disc((160, 220), (110, 80), 45), disc((160, 220), (112, 79), 44)
     picture = painted(mask, (170, 90, 60), (70, 110, 130))
     depth, known = np.full(mask.shape, 3.0, np.float32), np.ones(mask.shape, np.float32)

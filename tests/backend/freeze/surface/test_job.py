@@ -64,7 +64,7 @@ def test_the_surface_is_the_true_one(take, quiet):
     assert red[:, 0].mean() > 2 * red[:, 1:].mean(), "the patch is red"
 
 
-def test_it_is_kept_and_made_anew_with_the_take(take, quiet):
+def test_surface_is_cached_and_recomputed_with_the_take(take, quiet):
     world, folder = take
     make_surface(world.shot, SurfaceParams(take="solid"), quiet())
     before = folder.surface.read_bytes()
@@ -91,7 +91,7 @@ def test_a_placed_take_has_a_placed_surface(take, quiet):
     np.testing.assert_allclose(in_solve(folder)[0], points, atol=1e-4)
 
 
-def test_what_cannot_be_made_is_a_sentence(take, quiet):
+def test_uncreatable_paths_give_a_readable_error(take, quiet):
     world, folder = take
     with pytest.raises(JobError, match="no finished take"):
         make_surface(world.shot, SurfaceParams(take="nowhere"), quiet())
@@ -106,7 +106,7 @@ def test_what_cannot_be_made_is_a_sentence(take, quiet):
     folder.facts.write_text(json.dumps(facts), encoding="utf-8")
 
 
-def test_a_strangers_file_is_not_believed(take, quiet):
+def test_foreign_surface_file_is_rejected(take, quiet):
     world, folder = take
     make_surface(world.shot, SurfaceParams(take="solid"), quiet())
     whole = folder.surface.read_bytes()

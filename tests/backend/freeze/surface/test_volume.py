@@ -83,7 +83,7 @@ def test_a_plane_is_exact_and_whole():
     assert len(np.unique(triangles)) - len(often) + len(triangles) == 1, "one sheet without holes (Euler)"
 
 
-def test_voxels_are_pixels_and_no_more_than_there_may_be():
+def test_voxel_size_matches_pixels_and_count_is_bounded():
     views = [seen(0.0, 0.0)]
     flat = Contraction(np.zeros(3), 100.0)
     assert resolved(views, flat) == pytest.approx(4.0 / FOCAL, rel=0.05)

@@ -56,7 +56,7 @@ def take(trained_copy, quiet, tmp_path_factory):
     return trained_copy.shot.take("deep"), params
 
 
-def test_over_each_other_the_samples_are_the_frame(take):
+def test_flattened_deep_samples_equal_the_frame(take):
     folder, _ = take
     for n in (104, 105, 106):
         frame, file = read_frozen_exr(folder / f"{n:06d}.exr"), folder / "deep" / f"{n:06d}.exr"
@@ -114,7 +114,7 @@ def test_two_surfaces_become_two_samples_of_the_frames_colour():
     assert depth.tolist() == [[[1.0] * 4], [[2.0] * 4]]
 
 
-def test_only_frames_that_lack_a_whole_deep_picture_are_made_again(take, trained_copy, quiet):
+def test_only_frames_without_a_complete_deep_file_are_rerendered(take, trained_copy, quiet):
     folder, params = take
     files = [folder / "deep" / f"{n:06d}.exr" for n in (104, 105, 106)]
     times = [path.stat().st_mtime_ns for path in files]

@@ -82,7 +82,7 @@ def test_every_pose_shows_the_world_at_t_star(trained, takes):
 
 
 @pytest.mark.parametrize("detail", ["on", "off"])
-def test_two_instants_differ_where_the_patch_moved_and_nowhere_else(trained, takes, detail):
+def test_two_instants_differ_only_where_the_patch_moved(trained, takes, detail):
     world, _ = trained
     early, late = frozen(world, 105, 108, detail), frozen(world, 112, 108, detail)
     difference = np.abs(early.rgba[..., :3] - late.rgba[..., :3]).mean(-1)
@@ -188,7 +188,7 @@ def test_only_missing_frames_are_rendered_again(trained, quiet):
 
 
 @pytest.mark.parametrize("detail", ["on", "off"])
-def test_frames_written_beside_the_next_are_those_written_at_once(trained, quiet, monkeypatch, detail):
+def test_frames_written_in_a_thread_equal_those_written_directly(trained, quiet, monkeypatch, detail):
     world, _ = trained
     options = dict(t_star=108, first=103, last=106, detail=detail, develop="off")
     for take, limit in (("beside", 1 << 40), ("at once", -1)):
@@ -304,7 +304,7 @@ def test_ramp_changes_the_instant_per_frame(trained, quiet):
         assert psnr(linear_to_srgb(image.rgba[..., :3]), world.image(n, n / 15).numpy()) > 20
 
 
-def test_camera_path_of_its_own_size(trained, quiet, tmp_path):
+def test_camera_path_can_set_the_frame_size(trained, quiet, tmp_path):
     world, _ = trained
     viewmat = world.viewmats[7].clone()
     viewmat[2, 3] = 0.3
@@ -360,7 +360,7 @@ def test_wrong_requests_are_sentences(trained, quiet, params, word):
         freeze_shot(world.shot, FreezeParams(take="wrong", **params), quiet())
 
 
-def test_t_star_snaps_to_a_trained_frame_and_says_so(trained, quiet):
+def test_t_star_snaps_to_a_trained_frame_with_a_note(trained, quiet):
     world, _ = trained
     report = quiet()
     facts = freeze_shot(world.shot, FreezeParams(take="snap", t_star=109, develop="off"), report)

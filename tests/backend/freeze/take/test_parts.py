@@ -33,7 +33,7 @@ def part(shot, take, first, last, report):
     return freeze_part(shot, FreezeParams(**{**ASK, "take": take, "first": first, "last": last}), report)
 
 
-def test_frames_made_in_parts_are_those_made_at_once(frozen_shot, quiet):
+def test_frames_rendered_in_parts_equal_a_single_render(frozen_shot, quiet):
     params = FreezeParams(take="parts", **ASK)
     assert open_take(frozen_shot, params, quiet()) == {"t_star": 104, "first": 103, "last": 108, "frames": 6}
     assert part(frozen_shot, "parts", 107, 109, quiet()) == {"frames": 3, "rendered": 3}
@@ -50,7 +50,7 @@ def test_frames_made_in_parts_are_those_made_at_once(frozen_shot, quiet):
     assert all(in_parts[name] == data for name, data in at_once.items())
 
 
-def test_a_part_that_was_killed_is_made_again_and_the_rest_is_left_alone(frozen_shot, quiet):
+def test_killed_part_is_rerendered_and_others_kept(frozen_shot, quiet):
     folder, params = frozen_shot.take("killed"), FreezeParams(take="killed", **ASK)
     open_take(frozen_shot, params, quiet())
     part(frozen_shot, "killed", 103, 104, quiet())
@@ -180,7 +180,7 @@ def test_a_part_stops_when_its_take_is_opened_with_something_else(frozen_shot, q
 
 
 @pytest.mark.parametrize("name", ["000103.exr", "warp/000103.exr", "preview/000103.png"])
-def test_a_frame_that_a_copy_cut_off_is_made_again(frozen_shot, quiet, name):
+def test_truncated_frame_is_rendered_again(frozen_shot, quiet, name):
     params = FreezeParams(take="cut", **{**ASK, "last": 103})
     freeze_shot(frozen_shot, params, quiet())
     file = frozen_shot.take("cut") / name

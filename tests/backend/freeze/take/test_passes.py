@@ -75,7 +75,7 @@ def test_a_planes_passes_are_its_geometry(bands):
     assert np.abs(found["Vector"]).max() > 2.0, "or the test says nothing"
 
 
-def test_a_step_in_depth_tilts_no_normal_and_nothing_is_nowhere():
+def test_depth_step_does_not_tilt_normals_and_all_values_are_finite():
     depth, _ = plane_depth(FRAMES[1])
     depth[:, W // 2 :] *= 0.7  # a parallel, nearer plane, with the same normal
     depth[:5] = NO_DEPTH

@@ -91,7 +91,7 @@ def test_a_frame_is_its_warp_over_the_plate(trained, take):
     assert rows[2]["plate_share"] > 0.999, "frame 105 is its plate"  # one pixel of 3072 may come from another plate
 
 
-def test_without_detail_splats_alone_are_left(trained, take, quiet):
+def test_without_detail_only_splats_are_rendered(trained, take, quiet):
     world, _ = trained
     folder, _ = take
     whole = files(folder)
@@ -109,7 +109,7 @@ def test_without_detail_splats_alone_are_left(trained, take, quiet):
     assert not list((bare / "warp").glob("*.exr")), "warps of frames that are gone are gone"
 
 
-def test_a_frame_alone_is_the_frame_among_others(trained, take, quiet):
+def test_single_frame_equals_the_same_frame_in_a_range(trained, take, quiet):
     world, _ = trained
     freeze_shot(world.shot, FreezeParams(take="one", **{**RANGE, "first": 107, "last": 107}), quiet())
     one, whole = files(world.shot.take("one")), files(take[0])
@@ -156,7 +156,7 @@ def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
     assert facts[0]["plate_share"] == pytest.approx(facts[1]["plate_share"], abs=2e-3)
 
 
-def test_a_frame_whose_warp_is_gone_is_made_again(trained, take, quiet):
+def test_frame_without_its_warp_is_rendered_again(trained, take, quiet):
     world, _ = trained
     ask = FreezeParams(take="torn", **{**RANGE, "last": 104}, only_missing=True)
     freeze_shot(world.shot, ask, quiet())
@@ -304,7 +304,7 @@ def lit(tmp_path_factory, world, quiet):
     return shot
 
 
-def test_a_lamp_is_a_lamp_in_splats_alone(lit, quiet):
+def test_highlights_are_kept_in_splats_without_detail(lit, quiet):
     """Frames clipped at white could not exceed 1. Pixels away from the lamp are unchanged."""
     facts = freeze_shot(lit, FreezeParams(t_star=108, first=106, last=106, detail="off", develop="off"), quiet())
     frame = read_frozen_exr(lit.take("freeze") / "000106.exr")

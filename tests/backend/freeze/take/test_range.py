@@ -92,7 +92,7 @@ def test_a_newer_run_makes_every_frame_stale(trained, quiet):
     assert all(before[n] != t for n, t in times(folder).items())
 
 
-def test_frames_of_an_earlier_version_are_made_anew_and_that_is_said_once(trained, quiet):
+def test_frames_of_an_older_version_are_rerendered_with_one_note(trained, quiet):
     """Their previews do not name the take that they belong to."""
     world, _ = trained
     folder = world.shot.take("old")
@@ -152,7 +152,7 @@ def test_a_damaged_frame_is_rendered_again(trained, quiet):
 
 
 @pytest.mark.parametrize("grain", [True, False])
-def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quiet, grain):
+def test_grain_layer_does_not_change_the_picture(trained, quiet, grain):
     world, _ = trained
     folder = world.shot.take(f"grain{grain}")
     part = dict(t_star=104, develop="off", first=101, last=102, detail="off")
@@ -173,7 +173,7 @@ def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quie
         assert one.grain.any() and not np.array_equal(one.grain, next_frame.grain)
 
 
-def test_plates_bring_their_own_grain(trained, quiet):
+def test_plate_pixels_carry_plate_grain(trained, quiet):
     world, _ = trained
     ask = dict(t_star=104, develop="off", first=112, last=112)
     facts = freeze_shot(world.shot, FreezeParams(take="plates", **ask), quiet())

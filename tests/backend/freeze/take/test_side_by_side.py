@@ -110,7 +110,7 @@ def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(frozen_shot, quiet, on
     assert files(take.folder) == one_process[0]
 
 
-def test_what_stops_one_of_them_is_told_as_if_there_were_one(frozen_shot, quiet):
+def test_error_in_one_process_is_reported_like_a_single_process(frozen_shot, quiet):
     """An unreadable plate ends the take with the same message."""
     params, take, frames = opened(frozen_shot, "one-unreadable", quiet())
     plate = frozen_shot.plate(104)
@@ -161,7 +161,7 @@ def test_nothing_is_written_under_the_former_name_of_a_shot_that_was_renamed(fro
         moved.rename(frozen_shot.root)
 
 
-def test_as_many_as_cores_frames_and_memory_allow():
+def test_process_count_is_limited_by_cores_frames_and_memory():
     assert processes_for(300, 640 * 480, 16, 64e9) == 8
     assert processes_for(300, 640 * 480, 1, 64e9) == 1
     assert processes_for(30, 640 * 480, 16, 64e9) == 2
@@ -169,6 +169,6 @@ def test_as_many_as_cores_frames_and_memory_allow():
     assert processes_for(300, 640 * 480, 16, 0.0) == 1
 
 
-def test_threads_are_as_many_as_torch_is_told(monkeypatch):
+def test_thread_count_follows_torch(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     assert default_threads() == 1

@@ -43,7 +43,7 @@ def test_the_worst_frame_is_named_where_no_place_is():
     assert judge_take(all_facts).lines()[1:] == []
 
 
-def test_a_guess_at_the_end_is_told_with_frames_place_and_what_to_do():
+def test_guessed_area_is_reported_with_frames_place_and_advice():
     verdict = judge_take(facts(lost=range(31, 41)))
     assert verdict is not None and verdict.word == "fair"
     assert verdict.lines()[1:] == [
@@ -74,7 +74,7 @@ def test_a_take_that_is_mostly_guessed_is_poor():
     assert verdict is not None and verdict.word == "poor" and verdict.advice
 
 
-def test_a_take_of_splats_alone_says_so_and_one_of_before_says_nothing():
+def test_take_of_splats_only_is_reported_and_older_takes_are_not():
     splats_only = judge_take({**facts(), "detail": None})
     assert splats_only is not None and "Detail is off" in splats_only.sentences[0]
     assert judge_take({"t_star_frame": 8}) is None

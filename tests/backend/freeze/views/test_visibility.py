@@ -80,7 +80,7 @@ def test_it_is_what_float64_says(plate, with_ignored):
     assert (found.pixels.numpy()[expected[1] < -1e-3] == -1e6).all()
 
 
-def test_one_thread_or_many_and_any_shape_are_the_same(plate):
+def test_result_is_independent_of_threads_and_shape(plate):
     points, *camera = single(*plate)
     whole = visible_pixels(points, *camera, TOLERANCE, SOFT)
     for part in (slice(0, 1), slice(5, 22), slice(8000, 10007)):
@@ -92,7 +92,7 @@ def test_one_thread_or_many_and_any_shape_are_the_same(plate):
     assert visible_pixels(points[:0], *camera, TOLERANCE, SOFT).depth.shape == (0,)
 
 
-def test_what_is_no_number_is_seen_nowhere_and_reads_nothing_beyond_the_picture(plate):
+def test_non_finite_points_are_invisible_and_read_in_bounds(plate):
     _, *camera = single(*plate)
     odd = torch.tensor([[math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0], [0.0, -math.inf, 1.0], [1e30, 1e30, 1e30]])
     found = visible_pixels(odd, *camera, TOLERANCE, SOFT)
@@ -100,7 +100,7 @@ def test_what_is_no_number_is_seen_nowhere_and_reads_nothing_beyond_the_picture(
     assert bool(found.moving.isfinite().all()) and bool(found.explained.isfinite().all())
 
 
-def test_other_numbers_than_float32_are_refused(plate):
+def test_inputs_other_than_float32_are_refused(plate):
     points, *camera = single(*plate)
     with pytest.raises(ValueError, match="float32"):
         visible_pixels(points.double(), *camera, TOLERANCE, SOFT)
