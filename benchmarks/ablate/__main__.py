@@ -3,9 +3,9 @@
 Every rule and term of the freeze is switched off alone and in named combinations (`switches.py`). SCENE is a folder of
 benchmarks/synthetic; SHOT is a trained clip. Scenes are judged against truth: dB of delivered and developed frames by
 region, and recall of small objects. Clips are judged at instants drawn by a seed, except those used for tuning. Their
-figures are dB of still pixels, residual flow and flicker between neighbouring frozen frames, and CPU seconds. Each variant at
-each instant is one JSON file in DIR/ablate/CODE, so an interrupted run continues where it stopped. `--table` only
-prints the tables of existing records.
+figures are dB of still pixels, residual flow and flicker between neighbouring frozen frames, and CPU seconds. Each
+variant at each instant is one JSON file in DIR/ablate/CODE, so an interrupted run continues where it stopped. `--table`
+only prints the tables of existing records.
 
 Flicker is the mean absolute difference of two neighbouring frozen frames, on a scale of 0..255. The second frame is
 warped to the first by frozen depth and cameras; only pixels visible in both count. The spread in the table is the
