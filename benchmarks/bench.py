@@ -490,31 +490,63 @@ def _command(args: argparse.Namespace, argv: Sequence[str] | None) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="bench", description="Hosts and supervisions against truth.")
-    parser.add_argument("--quick", action="store_true", help="quick scenes, exact cameras, at most 5,000 Gaussians")
-    parser.add_argument("--size", choices=tuple(SIZES), help="synthetic scenes (medium, if no scene is named)")
-    parser.add_argument("--cameras", choices=("exact", "solved", "both"), default="exact", help="of synthetic scenes")
-    parser.add_argument("--scenes", default=str(default_folder()), metavar="DIR", help="of synthetic scenes")
-    parser.add_argument("--tuning", action="store_true", help="scenes to tune on instead of those to report on")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=[], metavar="KIND", help="these scenes alone")
-    parser.add_argument("--limits", action="store_true", help="the four scenes that break an assumption, alone")
-    parser.add_argument("--hard", action="store_true", help="the scenes with what a freeze loses in view, alone")
-    parser.add_argument("--truth", action="append", default=[], metavar="FOLDER", help="scene with rendered truth")
-    parser.add_argument("--shot", action="append", default=[], metavar="SHOT", help="solved shot of a real clip")
-    parser.add_argument("--results", default="output/bench", metavar="DIR", help="records, pictures and report")
-    parser.add_argument("--preset", action="append", choices=tuple(PRESETS), help="default: preview")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, help="only these (default: all)")
+    parser = argparse.ArgumentParser(prog="bench", description="Compares hosts and supervisions with ground truth.")
+    parser.add_argument(
+        "--quick", action="store_true", help="use quick scenes, exact cameras and at most 5,000 Gaussians"
+    )
+    parser.add_argument(
+        "--size", choices=tuple(SIZES), help="size of synthetic scenes (default: medium, if no scene is given)"
+    )
+    parser.add_argument(
+        "--cameras", choices=("exact", "solved", "both"), default="exact", help="cameras of synthetic scenes"
+    )
+    parser.add_argument("--scenes", default=str(default_folder()), metavar="DIR", help="folder of synthetic scenes")
+    parser.add_argument("--tuning", action="store_true", help="use the scenes for tuning instead of those for reports")
+    parser.add_argument(
+        "--kinds", nargs="+", choices=KINDS, default=[], metavar="KIND", help="use only scenes of these kinds"
+    )
+    parser.add_argument("--limits", action="store_true", help="use only the four scenes that violate an assumption")
+    parser.add_argument("--hard", action="store_true", help="use only the hard scenes")
+    parser.add_argument(
+        "--truth",
+        action="append",
+        default=[],
+        metavar="FOLDER",
+        help="scene with rendered ground truth; may be repeated",
+    )
+    parser.add_argument(
+        "--shot", action="append", default=[], metavar="SHOT", help="solved shot of a real clip; may be repeated"
+    )
+    parser.add_argument(
+        "--results", default="output/bench", metavar="DIR", help="folder for records, pictures and report"
+    )
+    parser.add_argument(
+        "--preset", action="append", choices=tuple(PRESETS), help="training preset; may be repeated (default: preview)"
+    )
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="methods to run (default: all)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="training seeds 0 to N - 1")
-    parser.add_argument("--reference", action="store_true", help="hosts in the published settings too: none and paper")
-    parser.add_argument("--ablations", action="store_true", help="the paper's and ours")
-    parser.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
-    parser.add_argument("--width", type=int, default=0, help="width of training images in pixels (0: the preset's)")
-    parser.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
+    parser.add_argument(
+        "--reference",
+        action="store_true",
+        help="also run hosts in their published settings, with supervision none and paper",
+    )
+    parser.add_argument("--ablations", action="store_true", help="also run the ablations of the paper and ours")
+    parser.add_argument("--iterations", type=int, default=0, help="training steps (0: the value of the preset)")
+    parser.add_argument(
+        "--width", type=int, default=0, help="width of training images in pixels (0: the value of the preset)"
+    )
+    parser.add_argument(
+        "--max-gaussians", type=int, default=0, help="largest number of Gaussians (0: the value of the preset)"
+    )
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
     parser.add_argument(
-        "--jobs", type=int, default=0, metavar="N", help="runs at once, each on its share of the cores (default: 2)"
+        "--jobs",
+        type=int,
+        default=0,
+        metavar="N",
+        help="concurrent runs, each with an equal share of the cores (default: 2)",
     )
-    parser.add_argument("--bpy", metavar="PYTHON", help="Python with Blender's module, renders synthetic scenes")
+    parser.add_argument("--bpy", metavar="PYTHON", help="Python with bpy, for rendering synthetic scenes")
     parser.add_argument("--tied", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--work", help=argparse.SUPPRESS)
     return parser

@@ -111,10 +111,10 @@ class Pooled:
         sky = ~torch.isfinite(truth)
         outside = occlusion_edges(truth) | sky | ~region
         inside = ~dilate(outside, INSIDE)
-        off = (depth[inside] - truth[inside]).abs()
-        self.errors.append(off / truth[inside])
+        error = (depth[inside] - truth[inside]).abs()
+        self.errors.append(error / truth[inside])
         if sigma is not None:
-            self.deviations.append(off / sigma[inside].clamp_min(1e-9))
+            self.deviations.append(error / sigma[inside].clamp_min(1e-9))
 
     def figures(self) -> dict[str, float | None]:
         """median and beyond (shares), boundary_f, precision, recall, within_1_sigma, within_2_sigma; None for a figure
@@ -204,8 +204,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of the trainings")
-    parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="training seeds")
+    parser.add_argument(
+        "--develop",
+        default="on",
+        choices=SWITCH,
+        help="off: use the Gaussians as the run trained them, without fine-tuning per instant",
+    )
     args = parser.parse_args(argv)
     found: dict[str, dict[str, dict[str, float | None]]] = {}
     for truth, runs in trained_scenes(args, args.seeds):

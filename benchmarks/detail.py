@@ -69,15 +69,16 @@ def judge(
     result["motion_from"] = clip.motion_from
     rows: dict[int, list[Row]] = {t_star: [] for t_star in t_stars}
     differences: list[float] = []
-    for old in strips.glob("t[0-9]*_[0-9]*.png") if strips else ():
-        old.unlink()  # of an earlier run
+    written: set[Path] = set()
     for n, frame in enumerate(frames):
         before: tuple[Tensor, Tensor] | None = None
         for t_star in t_stars:
             row, pictures, still = judge_frame(clip, frame, t_star)
             rows[t_star].append(row)
             if strips:
-                save_strip(strips / f"t{t_star:06d}_{frame:06d}.png", list(pictures.values()))
+                path = strips / f"t{t_star:06d}_{frame:06d}.png"
+                save_strip(path, list(pictures.values()))
+                written.add(path)
             if before is not None:
                 value = mean_difference(before[0], pictures["delivered"], before[1] & still)
                 differences += [] if value is None else [255.0 * value]
@@ -87,8 +88,11 @@ def judge(
         result["freezes"].append({"t_star": t_star, "frames": of_freeze, "mean": means(of_freeze)})
         if strips and worst:
             ranked = sorted(of_freeze, key=lambda row: row["withheld"]["best_90_db"])
-            for row in ranked[worst:]:
-                (strips / f"t{t_star:06d}_{row['frame']:06d}.png").unlink()
+            written -= {strips / f"t{t_star:06d}_{row['frame']:06d}.png" for row in ranked[worst:]}
+    # Only now, so that an interrupted run leaves the strips of the earlier one.
+    for path in strips.glob("t[0-9]*_[0-9]*.png") if strips else ():
+        if path not in written:
+            path.unlink()
     result["instants_differ_255"] = statistics.fmean(differences) if differences else None
     return result
 
@@ -125,7 +129,9 @@ def table(name: str, result: dict[str, Any]) -> list[str]:
     share = _mean(row["still_share"] for row in both[0])
     lines += ["", f"Still: {100 * (share or 0):.0f} % of the pixels, by {result['motion_from']}."]
     if result["instants_differ_255"] is not None:
-        lines[-1] += f" There two instants differ by {result['instants_differ_255']:.3f} / 255 on average."
+        lines[-1] += (
+            f" In these pixels, the two instants differ by {result['instants_differ_255']:.3f} / 255 on average."
+        )
     return lines
 
 
@@ -150,8 +156,8 @@ def chosen_frames(clip: DetailClip, args: argparse.Namespace) -> list[int]:
     frames = args.frames or clip.held_out()[:: args.every]
     unknown = set(frames) - set(clip.frames)
     if unknown or not frames:
-        what = f"frame {min(unknown)} is none of the clip's" if unknown else "no frame was held out of training"
-        raise ValueError(f"{what}: name some by --frames ({clip.frames[0]} to {clip.frames[-1]})")
+        what = f"frame {min(unknown)} is not in the clip" if unknown else "no frame was held out of training"
+        raise ValueError(f"{what}: choose frames with --frames ({clip.frames[0]} to {clip.frames[-1]})")
     return frames
 
 
@@ -159,18 +165,30 @@ def common_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments shared by all benchmarks of a real clip."""
     parser.add_argument("shot", type=Path)
     parser.add_argument("--run", default="main", metavar="NAME")
-    parser.add_argument("--t-star", type=int, nargs="+", metavar="N", help="default: suggested, and half a clip away")
-    parser.add_argument("--frames", type=int, nargs="+", metavar="N", help="only these")
-    parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th")
+    parser.add_argument(
+        "--t-star",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="instants (default: the suggested one, and one half a clip away)",
+    )
+    parser.add_argument(
+        "--frames", type=int, nargs="+", metavar="N", help="judge these frames (default: all that training left out)"
+    )
+    parser.add_argument(
+        "--every", type=int, default=1, metavar="K", help="judge every K-th of the frames that training left out"
+    )
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--worst", type=int, default=10, metavar="N", help="strips of so many frames (0: of all)")
+    parser.add_argument(
+        "--worst", type=int, default=10, metavar="N", help="keep strips of the N worst frames per instant (0: of all)"
+    )
     develop_argument(parser)
-    parser.add_argument("--no-strips", action="store_true", help="figures alone")
+    parser.add_argument("--no-strips", action="store_true", help="write no strips")
 
 
 def develop_argument(parser: argparse.ArgumentParser) -> None:
     """Adds `--develop`: whether instants are developed."""
-    text = "off: instants stay as the run has them"
+    text = "off: use the Gaussians as the run trained them, without fine-tuning per instant"
     parser.add_argument("--develop", default="on", choices=SWITCH, help=text)
 
 
@@ -184,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     common_arguments(parser)
-    parser.add_argument("--width", type=int, default=0, help="pixels (0: the plates' own)")
+    parser.add_argument("--width", type=int, default=0, help="width in pixels (0: that of the plates)")
     args = parser.parse_args(argv)
     clip = open_clip(args.shot, args.run, args.width, args.develop == "on")
     frames = chosen_frames(clip, args)

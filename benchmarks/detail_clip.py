@@ -66,9 +66,9 @@ class DetailClip:
         self.develop = develop
         self.shot = shot
         self.run, self.scene = load_run(shot, run, torch.device("cpu")), load_scene(shot)
-        own = Plates(shot)
-        size = (width, round(own.height * width / own.width)) if width else None
-        self.plates = Plates(shot, size) if size else own
+        plates = Plates(shot)
+        size = (width, round(plates.height * width / plates.width)) if width else None
+        self.plates = Plates(shot, size) if size else plates
         self.width, self.height = self.plates.width, self.plates.height
         self.Ks = self.scene.camera_at(self.width, self.height)
         self.compositor = Compositor(self.run, self.scene, self.plates)
@@ -97,8 +97,8 @@ class DetailClip:
         suggested = choose_t_star(self.shot, self.scene, self.run, FreezeParams(), Log())
         half = len(self.frames) // 2
         at = self.frames.index(suggested)
-        other = self.frames[at + half if at + half < len(self.frames) else at - half]
-        return [suggested, min(self.run.train_frames, key=lambda frame: abs(frame - other))]
+        second = self.frames[at + half if at + half < len(self.frames) else at - half]
+        return [suggested, min(self.run.train_frames, key=lambda frame: abs(frame - second))]
 
     def camera(self, frame: int) -> tuple[Tensor, Tensor]:
         """(world-to-camera [4, 4], K [3, 3]) of a frame, scene units and pixels."""
@@ -112,11 +112,11 @@ class DetailClip:
     def frozen(self, t_star: int, keep: bool = False) -> FrozenGaussians:
         """The developed instant from which takes are rendered. `keep`: save it with the run for other processes."""
         if t_star not in self._frozen:
-            made = self.field(t_star)
+            gaussians = self.field(t_star)
             if self.develop and t_star in self.run.train_frames:
                 print(f"developing t* {t_star}", file=sys.stderr, flush=True)
-                made = developed(self.shot, self.run, self.scene, t_star, made, keep=keep)
-            self._frozen[t_star] = made
+                gaussians = developed(self.shot, self.run, self.scene, t_star, gaussians, keep=keep)
+            self._frozen[t_star] = gaussians
         return self._frozen[t_star]
 
     def splats(self, frame: int, t_star: int, frozen: FrozenGaussians | None = None) -> FrozenImage:
@@ -160,23 +160,27 @@ class DetailClip:
         The second is the matte of frame t*, warped to this frame by the frozen depth; 0 outside the view of t*. If the
         shot has no mattes, both are the gate's matte in the frozen frame.
         """
-        own, of_t_star = self.matte(frame), self.matte(t_star)
-        if own is None or of_t_star is None:
+        frame_matte, matte_t_star = self.matte(frame), self.matte(t_star)
+        if frame_matte is None or matte_t_star is None:
             gate = (view.image.motion >= STILL_MATTE).float()
             return gate, gate
         places, depth = induced_places(view.detailed.depth, *self.camera(frame), *self.camera(t_star))
         known = inside(places, self.width, self.height, 0.0) & (depth > 0)
-        return own, torch.where(known, sampled(of_t_star, places, nearest=True), 0.0)
+        return frame_matte, torch.where(known, sampled(matte_t_star, places, nearest=True), 0.0)
 
     def still(self, frame: int, t_star: int, view: View) -> Tensor:
         """bool [H, W] pixels where the frozen frame must equal the plate.
 
         Excludes pixels masked as no part of the scene, such as a burnt-in logo, because the freeze removes them.
         """
-        own, frozen = self.mattes(frame, t_star, view)
+        frame_matte, frozen = self.mattes(frame, t_star, view)
         ignored = self.compositor.source_views.view(frame).ignored
         masked = None if ignored is None else resized(ignored[..., 0], self.width, self.height) > 0.0
-        return still_pixels(own, frozen > 0.75) if masked is None else still_pixels(own, frozen > 0.75) & ~masked
+        return (
+            still_pixels(frame_matte, frozen > 0.75)
+            if masked is None
+            else still_pixels(frame_matte, frozen > 0.75) & ~masked
+        )
 
 
 def over(color: Tensor, alpha: Tensor) -> Tensor:

@@ -70,7 +70,7 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
             raw = copy / "frames" / row["file"]
             _enlarge(raw if raw.is_file() else copy / "frames" / name, footage / name, factor, rng)
     for frame in set(frames) - real:
-        nearest = min(real, key=lambda other: abs(other - frame))
+        nearest = min(real, key=lambda existing: abs(existing - frame))
         os.link(footage / frame_file(nearest, ".png"), footage / frame_file(frame, ".png"))
     record |= {"source_size": [record["width"] * factor, record["height"] * factor], "extended": False}
     settings = {**record.get("config", {}), "working_height": record["height"]}
@@ -81,12 +81,12 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
     for checkpoint in (copy / "runs").glob("*/checkpoint.safetensors"):  # they were trained on the smaller pictures
         tensors, facts = load_checkpoint(checkpoint)
         save_checkpoint(checkpoint, tensors, {**facts, "pictures": key})
-    made = Shot.open(copy)
-    made.update(source=str(footage))
-    note = Plates(made).note
+    enlarged_shot = Shot.open(copy)
+    enlarged_shot.update(source=str(footage))
+    note = Plates(enlarged_shot).note
     if note:
         raise ValueError(f"the enlarged plates are not read: {note}")
-    return made
+    return enlarged_shot
 
 
 def _around(frames: Sequence[int], poses: Sequence[int]) -> list[int]:
@@ -117,10 +117,10 @@ def measure(shot: Path, run: str, width: int, poses: Sequence[int], develop: boo
         since = time.perf_counter()
         image = clip.splats(pose, t_star)
         splats = time.perf_counter() - since
-        made = clip.detailed(pose, t_star, image)
+        detailed = clip.detailed(pose, t_star, image)
         rows.append({"frame": pose, "splats": splats, "whole": time.perf_counter() - since})
-        sources |= {int(frame) for frame in made.source.unique().tolist()} - {0}
-        del image, made  # as a take does: each frame is freed before the next
+        sources |= {int(frame) for frame in detailed.source.unique().tolist()} - {0}
+        del image, detailed  # as a take does: each frame is freed before the next
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "width": clip.width,
@@ -190,9 +190,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--run", default="main", metavar="NAME")
     parser.add_argument("--results", type=Path, metavar="DIR")
     parser.add_argument(
-        "--widths", type=int, nargs="+", default=list(WIDTHS), metavar="W", help="multiples of the clip's"
+        "--widths",
+        type=int,
+        nargs="+",
+        default=list(WIDTHS),
+        metavar="W",
+        help="widths as multiples of the clip's width",
     )
-    parser.add_argument("--frames", type=int, nargs="+", metavar="N", help="along the path (default: by width)")
+    parser.add_argument(
+        "--frames",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="number of frames along the path (default: depends on the width)",
+    )
     develop_argument(parser)
     parser.add_argument("--work", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)

@@ -70,7 +70,7 @@ class Shown:
     """{each of `WHAT`: [H, W] frozen depth}; plates may add a surface to it."""
     pictures: dict[str, Tensor]
     """{each of `WHAT`: [H, W, 3] picture}."""
-    own: Tensor
+    matte: Tensor
     """[H, W] motion matte of the frame, 0..1."""
     matte_t_star: Tensor
     """[H, W] motion matte of t*, warped to this frame."""
@@ -107,10 +107,10 @@ class Sums:
 def show(clip: DetailClip, frame: int, t_star: int) -> Shown:
     """The frame with all compared pictures, depths and mattes."""
     view = clip.view(frame, t_star)
-    own, matte_t_star = clip.mattes(frame, t_star, view)
+    frame_matte, matte_t_star = clip.mattes(frame, t_star, view)
     pictures = {"plate": clip.plate(frame), "splats": view.splats, "delivered": view.picture}
     depths = {"plate": view.detailed.depth, "splats": view.image.depth, "delivered": view.detailed.depth}
-    return Shown(frame, depths, pictures, own, matte_t_star)
+    return Shown(frame, depths, pictures, frame_matte, matte_t_star)
 
 
 @dataclass
@@ -131,8 +131,8 @@ def lay_over(clip: DetailClip, a: Shown, b: Shown, what: str) -> Pair:
     """Correspondence of frames a and b, by the depth of one of `WHAT`."""
     places, depth = induced_places(a.depths[what], *clip.camera(a.frame), *clip.camera(b.frame))
     both = seen_again(places, depth, b.depths[what]) & inside(places, clip.width, clip.height, 4.0)
-    own_b, matte_t_star_b = (sampled(matte, places, nearest=True) for matte in (b.own, b.matte_t_star))
-    matte = torch.stack([a.own, own_b]).amax(0)
+    second_matte, matte_t_star_b = (sampled(matte, places, nearest=True) for matte in (b.matte, b.matte_t_star))
+    matte = torch.stack([a.matte, second_matte]).amax(0)
     mover = torch.stack([a.matte_t_star, matte_t_star_b]).amax(0) > MOVER_MATTE
     inner = ~dilate(~both, HIDDEN_MARGIN)
     return Pair(places, both, inner & ((matte > MOVER_MATTE) | mover), inner & still_pixels(matte, mover))
@@ -207,8 +207,8 @@ def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: in
 
 def table(name: str, freezes: Sequence[dict[str, Any]]) -> list[str]:
     """Markdown rows of the clip's figures, one per t* and picture."""
-    header = [name, "flow left, moving, px", "still, px", "more", "more, mean of frames", f"frames over {ALLOWED}"]
-    header += ["worst frame", "difference, moving, / 255", "still, / 255"]
+    header = [name, "residual flow, moving, px", "still, px", "excess", "mean excess of frames"]
+    header += [f"frames over {ALLOWED}", "worst frame", "difference, moving, / 255", "still, / 255"]
     lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
     for freeze in freezes:
         for what in WHAT:

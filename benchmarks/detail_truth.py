@@ -137,27 +137,27 @@ def perceived_table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
         for scene, regions in found.items()
         for region, of in regions.items()
     ]
-    head = ["", "| scene | region | ST-LPIPS, less is better |", "|---|---|---|"]
+    head = ["", "| scene | region | ST-LPIPS, lower is better |", "|---|---|---|"]
     return [*head, *lines] if lines else []
 
 
 def recalls(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, tuple[float | None, float | None]]]:
     """{thing: {variant: share of its pixels that are shown, over all poses and in the worst one}}."""
-    things = dict.fromkeys(thing for row in rows for of in row[RECALLED].values() for thing in of)
+    objects = dict.fromkeys(name for row in rows for of in row[RECALLED].values() for name in of)
     return {
-        thing: {v: overall([row[RECALLED][v][thing] for row in rows if thing in row[RECALLED][v]]) for v in VARIANTS}
-        for thing in things
+        name: {v: overall([row[RECALLED][v][name] for row in rows if name in row[RECALLED][v]]) for v in VARIANTS}
+        for name in objects
     }
 
 
 def recall_table(found: dict[str, dict[str, dict[str, tuple[float | None, float | None]]]]) -> list[str]:
     """Recall by scene and thing in Markdown; [] without a small mover."""
     lines = [
-        f"| {scene} | {thing} | {' -> '.join(' / '.join(_share(s) for s in of[v]) for v in VARIANTS)} |"
-        for scene, things in found.items()
-        for thing, of in things.items()
+        f"| {scene} | {name} | {' -> '.join(' / '.join(_share(s) for s in of[v]) for v in VARIANTS)} |"
+        for scene, objects in found.items()
+        for name, of in objects.items()
     ]
-    head = ["", "| scene | thing | recall: all poses / the worst |", "|---|---|---|"]
+    head = ["", "| scene | object | recall: all poses / worst pose |", "|---|---|---|"]
     return [*head, *lines] if lines else []
 
 
@@ -170,8 +170,10 @@ def scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
     parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
-    parser.add_argument("--t-star", type=int, nargs="+", metavar="N", help="only these")
-    parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th pose")
+    parser.add_argument(
+        "--t-star", type=int, nargs="+", metavar="N", help="judge these instants (default: all of the scene)"
+    )
+    parser.add_argument("--every", type=int, default=1, metavar="K", help="judge every K-th pose")
     parser.add_argument("--iterations", type=int, default=1500)
     parser.add_argument("--gaussians", type=int, default=10_000)
 
@@ -181,9 +183,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
-    parser.add_argument("--seed", type=int, default=0, help="of the training")
-    parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
-    parser.add_argument("--delivered", action="store_true", help="judge at the size of the plates")
+    parser.add_argument("--seed", type=int, default=0, help="training seed")
+    parser.add_argument(
+        "--develop",
+        default="on",
+        choices=SWITCH,
+        help="off: use the Gaussians as the run trained them, without fine-tuning per instant",
+    )
+    parser.add_argument("--delivered", action="store_true", help="judge at the resolution of the plates")
     parser.add_argument("--train-only", action="store_true")
     args = parser.parse_args(argv)
     found, seen, recalled, results = {}, {}, {}, args.results.absolute()

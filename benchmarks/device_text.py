@@ -174,8 +174,8 @@ _TAKEN = {
 
 def _plain_function(whole: str, kernel: Any) -> str:
     """Function text of a kernel whose arguments are numbers and pointers, and whose threads are independent."""
-    held = [cell.cell_contents for cell in kernel.func.__closure__]
-    (native,) = (each for each in held if hasattr(each, "native_snippet"))
+    cells = [cell.cell_contents for cell in kernel.func.__closure__]
+    (native,) = (each for each in cells if hasattr(each, "native_snippet"))
     taken = "".join(f"const {_TAKEN[arg.type].format(arg.label, i)} " for i, arg in enumerate(kernel.adj.args))
     return _function(whole, f"{taken}const int tid = task;\n{native.native_snippet}")
 
@@ -235,9 +235,9 @@ def judge(rows: list[dict[str, Any]], bound: float = 1e-5) -> list[str]:
         if not row["met"]:
             wrong.append(f"{row['kernel']}: a vote, shuffle or barrier is not reached by all threads")
         kernel = row["kernel"].rstrip("0123456789")
-        for name, (count, of, off) in row["differs"].items():
-            if kernel not in BACKWARD or not off <= bound:
-                wrong.append(f"{row['kernel']}: {name} differs in {count} of {of} words, by {off:.1e}")
+        for name, (count, of, distance) in row["differs"].items():
+            if kernel not in BACKWARD or not distance <= bound:
+                wrong.append(f"{row['kernel']}: {name} differs in {count} of {of} words, by {distance:.1e}")
     return wrong
 
 
@@ -294,8 +294,8 @@ def note_scenes(launches: Launches) -> list[tuple[int, int]]:
     """
     hits: list[tuple[int, int]] = []
 
-    def draw(*asked: Any, **more: Any) -> None:
-        hits.append(_drawn(*asked, **more))
+    def draw(*args: Any, **more: Any) -> None:
+        hits.append(_drawn(*args, **more))
 
     step, wide = hit_lists.HITS_STEP, source.WIDE_FROM
     hit_lists.HITS_STEP = 1
@@ -316,7 +316,7 @@ def note_scenes(launches: Launches) -> list[tuple[int, int]]:
     return hits
 
 
-def note_others(launches: Launches) -> None:
+def note_training_kernels(launches: Launches) -> None:
     """Runs SSIM, the loss, Adam and a field's planes with their gradients, including edge cases: odd sizes, ignored
     pixels, rows out of view, a skipped step, points that are NaN or outside the box, planes of one node, channel counts
     not divisible by four."""
@@ -332,9 +332,9 @@ def note_others(launches: Launches) -> None:
         options = [{"rows": True, "reach": 2.0}, {"clamp": (-0.5, 0.5)}, {"lr": 0.1}]
         groups = [{"params": [leaf], **more} for leaf, more in zip(leaves, options, strict=True)]
         optimizer = adam.FusedAdam(groups, lr=0.01, kernel=True)
-        for spoilt in (False, True, False):
+        for has_nan in (False, True, False):
             grads = [torch.randn(leaf.shape, generator=g) for leaf in leaves]
-            if spoilt:
+            if has_nan:
                 grads[1][::3] = float("nan")
             for leaf, grad in zip(leaves, grads, strict=True):
                 leaf.grad = grad
@@ -353,22 +353,26 @@ def note_others(launches: Launches) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--sanitize", action="store_true", help="under address, undefined and thread sanitizers, too")
+    parser.add_argument(
+        "--sanitize", action="store_true", help="also run under the address, undefined-behaviour and thread sanitizers"
+    )
     sanitize = parser.parse_args().sanitize
     if compiler() is None:
         print("There is no C++ compiler (c++, g++ or clang++) on the PATH.", file=sys.stderr)
         return 2
     wrong: list[str] = []
-    with tempfile.TemporaryDirectory() as made:
+    with tempfile.TemporaryDirectory() as folder:
         launches = Launches()
         note_scenes(launches)
-        note_others(launches)
-        launches.write(Path(made))
+        note_training_kernels(launches)
+        launches.write(Path(folder))
         for which in BUILDS if sanitize else ("plain",):
-            rows, said = run(build(Path(made), which), 4 if which == "thread" else 1 << 30)
+            rows, said = run(build(Path(folder), which), 4 if which == "thread" else 1 << 30)
             blocks = sum(row["blocks"] for row in rows)
-            worst = max((off for row in rows for _, _, off in row["differs"].values()), default=0.0)
-            print(f"{which}: {len(rows)} launches, {blocks} blocks, gradients off by {worst:.1e} at most", flush=True)
+            worst = max((distance for row in rows for _, _, distance in row["differs"].values()), default=0.0)
+            print(
+                f"{which}: {len(rows)} launches, {blocks} blocks, largest gradient difference {worst:.1e}", flush=True
+            )
             wrong += [f"{which}: {line}" for line in [*judge(rows), *said.splitlines()[:40]]]
             wrong += [] if len(rows) == len(launches.records) else [f"{which}: it ended after {len(rows)} launches"]
     print("\n".join(wrong) or "nothing is wrong")

@@ -39,7 +39,7 @@ from torch_backend.footage.opening import open_source
 ROOT = Path(__file__).resolve().parents[1]
 CLIP = ROOT / "examples" / "sitting.mp4"
 CLIP_FRAMES = 74
-OTHER_FRAMES = 20
+RATES_CLIP_FRAMES = 20
 """Frames of the shot that gives the rates. Its parts have 8 or 4 frames, to separate fixed cost and cost per frame."""
 TASKSET = ("taskset", "--cpu-list")
 
@@ -173,7 +173,7 @@ def run(folder: Path, host: Host, session_tasks: int, at_once: int, seed: int) -
     return job, time.monotonic() - began
 
 
-def told(said: dict[str, Any], job: Job, clock: float, at_once: int) -> None:
+def print_comparison(said: dict[str, Any], job: Job, clock: float, at_once: int) -> None:
     """Prints the estimate and the measurement side by side."""
     took: dict[str, list[float]] = {}
     for shot in sorted((job.folder / "shots").glob(f"*{SHOT_SUFFIX}")):
@@ -191,15 +191,15 @@ def told(said: dict[str, Any], job: Job, clock: float, at_once: int) -> None:
         print(f"{what}: estimated {guess:.0f}, measured {was:.0f}, {100.0 * (guess / was - 1.0):+.0f} %")
 
 
-def alone(folder: Path, there: Path, host: Host) -> None:
+def repeat_locally(folder: Path, target: Path, host: Host) -> None:
     """Repeats all takes and bakes of a job from its trained shots, on this machine with all its cores."""
     for shot in sorted((folder / "shots").glob(f"*{SHOT_SUFFIX}")):
-        copy = there / "shots" / shot.name
+        copy = target / "shots" / shot.name
         shutil.copytree(shot, copy, ignore=shutil.ignore_patterns("takes", "farm", "developed", "jobs"))
         for take in sorted(ShotFolder(shot).takes.iterdir()):
             t_star = read_json(take / "take.json")["t_star_frame"]
             backend("freeze", str(copy), "--take", take.name, "--t-star", str(t_star))
-            out = there / "baked" / shot.name.removesuffix(SHOT_SUFFIX) / take.name
+            out = target / "baked" / shot.name.removesuffix(SHOT_SUFFIX) / take.name
             baked(host, ["--shot", str(copy), "--take", take.name, "--output", str(out)])
 
 
@@ -248,28 +248,30 @@ def compared(ours: Path, theirs: Path) -> bool:
         kind = (
             f"{'baked' if name.parts[0] == 'baked' else name.parts[4] if len(name.parts) > 5 else 'take'} {path.suffix}"
         )
-        other = ours / name
-        same.setdefault(kind, []).append(other.is_file() and other.read_bytes() == path.read_bytes())
+        second = ours / name
+        same.setdefault(kind, []).append(second.is_file() and second.read_bytes() == path.read_bytes())
         if not same[kind][-1]:
             different.append(str(name))
     for kind, equal in sorted(same.items()):
-        print(f"{kind:<16}{sum(equal):>5} of {len(equal)} files are the same, bit for bit")
+        print(f"{kind:<16}{sum(equal):>5} of {len(equal)} files are bit-identical")
     for name in different[:10]:
-        print(f"  not: {name}")
+        print(f"  differs: {name}")
     return not different
 
 
 def main() -> int:
     """Runs the benchmark; returns 1 if a frame differs, else 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--output", type=Path, required=True, help="folder, which must not be there")
+    parser.add_argument("--output", type=Path, required=True, help="output folder, which must not exist yet")
     parser.add_argument("--openjd", default=sys.executable, help="Python with openjd-cli")
     parser.add_argument("--blender", default="", help="Blender's program (default: a bpy wheel)")
-    parser.add_argument("--measure", action="store_true", help="estimate by the rates of another shot, run first")
+    parser.add_argument(
+        "--measure", action="store_true", help="first measure another shot, and use its rates for the estimate"
+    )
     parser.add_argument("--shots", type=int, default=3)
-    parser.add_argument("--length", type=int, default=24, help="frames of a shot")
-    parser.add_argument("--part", type=int, default=3, help="frames of a task")
-    parser.add_argument("--shrink", type=int, default=2, help="of 640 x 480")
+    parser.add_argument("--length", type=int, default=24, help="frames per shot")
+    parser.add_argument("--part", type=int, default=3, help="frames per task")
+    parser.add_argument("--shrink", type=int, default=2, help="divisor of the size of 640 x 480")
     parser.add_argument("--iterations", type=int, default=60)
     parser.add_argument("--session-tasks", type=int, default=4)
     parser.add_argument("--at-once", type=int, default=2, choices=HOSTS)
@@ -282,27 +284,27 @@ def main() -> int:
     options = ["--iterations", str(args.iterations), "--session-tasks", str(args.session_tasks)]
     rates: list[str] = []
     if args.measure:
-        clip = clip_of(out / "clips", "other", 18, OTHER_FRAMES, args.shrink)
-        exported(out / "other", [clip], [*options, "--t-star", str(OTHER_FRAMES // 2), "--frames", "8"])
+        clip = clip_of(out / "clips", "other", 18, RATES_CLIP_FRAMES, args.shrink)
+        exported(out / "other", [clip], [*options, "--t-star", str(RATES_CLIP_FRAMES // 2), "--frames", "8"])
         run(out / "other", host, args.session_tasks, args.at_once, args.seed)
         backend("farm", "measure", str(out / "other" / "shots" / f"other{SHOT_SUFFIX}"), "--output", str(out))
         rates = ["--rates", str(out / "rates.json")]
     names = [f"shot{n + 1}" for n in range(args.shots)]
-    apart = max(1, (CLIP_FRAMES - args.length) // max(1, args.shots - 1))
-    clips = [clip_of(out / "clips", name, 1 + n * apart, args.length, args.shrink) for n, name in enumerate(names)]
+    spacing = max(1, (CLIP_FRAMES - args.length) // max(1, args.shots - 1))
+    clips = [clip_of(out / "clips", name, 1 + n * spacing, args.length, args.shrink) for n, name in enumerate(names)]
     instants = f"{args.length // 3},{2 * args.length // 3}"
     options += ["--t-star", instants, "--frames", str(args.part)]
     said = exported(out / "job", clips, options)
     if rates:
         guess = f"{said['core_hours'] * 3600:.0f} core-seconds, {said['on_hosts'][str(args.at_once)]:.0f} by the clock"
-        print(f"by the program's own rates: {guess}")
+        print(f"estimate by the program's built-in rates: {guess}")
         said = exported(out / "job", clips, [*options, *rates])
     job, clock = run(out / "job", host, args.session_tasks, args.at_once, args.seed)
     print(f"load {os.getloadavg()}", flush=True)
-    told(said, job, clock, args.at_once)
+    print_comparison(said, job, clock, args.at_once)
     backend("farm", "measure", *map(str, (out / "job" / "shots").iterdir()), "--output", str(out / "job"))
     print(f"rates of this run: {out / 'job' / 'rates.json'}", flush=True)
-    alone(out / "job", out / "alone", host)
+    repeat_locally(out / "job", out / "alone", host)
     return 0 if compared(out / "job", out / "alone") else 1
 
 

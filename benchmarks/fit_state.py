@@ -78,9 +78,9 @@ class Case:
 
     def differs(self) -> Tensor:
         """[N, h, w] in 0..1: degree to which plate and truth differ."""
-        off = torch.stack([blurred(each, 1.0).abs().amax(-1) for each in self.plate - self.truth])
+        difference = torch.stack([blurred(each, 1.0).abs().amax(-1) for each in self.plate - self.truth])
         low, high = DIFFERS
-        return ((off - low) / (high - low)).clamp(0.0, 1.0)
+        return ((difference - low) / (high - low)).clamp(0.0, 1.0)
 
 
 def collect(truth: TruthScene, run: str, name: str, t_stars: Sequence[int], every: int) -> Case:
@@ -161,8 +161,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
     parser.set_defaults(every=2)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the training")
-    parser.add_argument("--cross", action="store_true", help="judge each scene by weights fitted on the others")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="training seeds")
+    parser.add_argument("--cross", action="store_true", help="judge each scene by weights fitted on all other scenes")
     args = parser.parse_args(argv)
     cases = [
         collect(truth, run, f"{truth.name} s{seed}", args.t_star or truth.t_stars, args.every)
@@ -171,8 +171,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     ]
     print(fit(cases))
     for case in cases:
-        others = [other for other in cases if other.name.split(" s")[0] != case.name.split(" s")[0]]
-        figures = judged(case, fit(others if args.cross and others else cases))
+        training_cases = [candidate for candidate in cases if candidate.name.split(" s")[0] != case.name.split(" s")[0]]
+        figures = judged(case, fit(training_cases if args.cross and training_cases else cases))
         print(f"{case.name}: " + ", ".join(f"{name} {value:.2f}" for name, value in figures.items()), flush=True)
 
 

@@ -332,8 +332,8 @@ def _short_list(stage: Stage, name: str) -> dict[str, Any]:
         for what, share in (("whole_ms", 1.0), ("tenth_ms", 0.1)):
             hit_lists.forget_demands()
             if share < 1.0:
-                held = max(1, int(share * times["hits"]))
-                hit_lists.HITS_MAX, hit_lists.HITS_STEP = held, min(step, held)
+                capacity = max(1, int(share * times["hits"]))
+                hit_lists.HITS_MAX, hit_lists.HITS_STEP = capacity, min(step, capacity)
             case.image()
             times["hits"] = max(int(demand.most) for demand in hit_lists._demands.values())
             times[what] = round(min(case.run()[1] for _ in range(2 if stage.dry else 5)), 3)
@@ -582,15 +582,15 @@ def _resumed(stage: Stage) -> dict[str, Any]:
     save_run(trainer, path)
     row: dict[str, Any] = {"at": trainer.iteration}
     for device in dict.fromkeys((stage.device.type, "cpu")):
-        other = Trainer(
+        resumed = Trainer(
             trainer.scene, trainer.images.to(device), trainer.train_ids, trainer.config, Warnings(), {}, device
         )
-        restore_run(other, path)
-        before = len(other.model.gaussians)
+        restore_run(resumed, path)
+        before = len(resumed.model.gaussians)
         for _ in range(3):
-            _step(other)
-        loss = float(other.step())
-        row[device] = {"gaussians": [before, len(other.model.gaussians)], "loss": loss}
+            _step(resumed)
+        loss = float(resumed.step())
+        row[device] = {"gaussians": [before, len(resumed.model.gaussians)], "loss": loss}
     path.unlink()
     return row
 
@@ -650,10 +650,14 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("stage", choices=tuple(STAGES))
     parser.add_argument("--results", type=Path, default=Path("output/gpu"), metavar="DIR")
-    parser.add_argument("--shot", type=Path, help="a solved shot folder, copied: for training and limits")
-    parser.add_argument("--only", nargs="+", default=[], metavar="PART", help="these parts of the stage alone")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="of the stage (default: %(default)g)")
-    parser.add_argument("--dry-run", action="store_true", help="on the processor, at tiny sizes: figures mean nothing")
+    parser.add_argument("--shot", type=Path, help="solved shot folder for the stages training and limits; it is copied")
+    parser.add_argument("--only", nargs="+", default=[], metavar="PART", help="run only these parts of the stage")
+    parser.add_argument(
+        "--seconds", type=float, default=SECONDS, help="time limit of the stage in seconds (default: %(default)g)"
+    )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="run on the CPU at tiny sizes; the figures are meaningless"
+    )
     args = parser.parse_args(words)
     if not args.dry_run and (refusal := cuda_refusal()):
         print(f"{refusal} --dry-run goes through the stage on the processor.", file=sys.stderr)

@@ -34,7 +34,7 @@ SOURCES = {"solve": "our solve", "abc": "Alembic", "usdc": "USD"}
 """Source of the cameras (file ending) -> name in the table."""
 HEADINGS = (
     "| scene | cameras | residual, px | points | same keypoints, px: mean and median (our solve) | focal length, px "
-    "| off the true positions, mm | rotations, degrees | held out, dB |"
+    "| position error, mm | rotation error, degrees | held out, dB |"
 )
 
 
@@ -65,9 +65,9 @@ def solved(scene: SyntheticScene, folder: Path, source: str, bpy: Path) -> Shot:
 def compared(shot: Shot, ours: Shot) -> str:
     """Mean and median residual over the keypoints triangulated by both solves; those of `ours` in brackets."""
     printed = _run([sys.executable, "-P", "-m", "benchmarks.synthetic.residuals", shot.colmap, ours.colmap])
-    one, other = ({(name, x, y): error for name, x, y, error in rows} for rows in json.loads(printed))
-    both = sorted(one.keys() & other.keys())
-    found = [f"{np.mean(e):.3f}, {np.median(e):.3f}" for e in ([each[key] for key in both] for each in (one, other))]
+    one, second = ({(name, x, y): error for name, x, y, error in rows} for rows in json.loads(printed))
+    both = sorted(one.keys() & second.keys())
+    found = [f"{np.mean(e):.3f}, {np.median(e):.3f}" for e in ([each[key] for key in both] for each in (one, second))]
     return f"{found[0]} ({found[1]})"
 
 
@@ -116,7 +116,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--iterations", type=int, default=1500)
     parser.add_argument("--gaussians", type=int, default=10_000)
-    parser.add_argument("--bpy", help="Python with bpy, or its environment (default: the one that set-up made)")
+    parser.add_argument("--bpy", help="Python with bpy, or its environment (default: that of the set-up)")
     args = parser.parse_args(argv)
     print(HEADINGS, "|---|---|---:|---:|---|---:|---:|---:|---:|", sep="\n", flush=True)
     for path in args.scenes:

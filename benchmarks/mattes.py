@@ -80,12 +80,12 @@ def best_poses(scene: SyntheticScene, t_star: int, masks: dict[str, dict[int, ND
     K[:2, 2] += width, height
     found: dict[str, int] = {}
     for name, (first, last) in faces_of_people(scene.root).items():
-        alone = RayScene(standing.vertices, standing.triangles[first:last])
+        person = RayScene(standing.vertices, standing.triangles[first:last])
         score: dict[int, tuple[float, int]] = {}
         for pose, mask in masks[name].items():
             view = View(scene.world_to_camera[pose], K, 3 * width, 3 * height)
             rays = view.rays()
-            whole = int((alone.cast(np.broadcast_to(view.eye, rays.shape), rays).face >= 0).sum())
+            whole = int((person.cast(np.broadcast_to(view.eye, rays.shape), rays).face >= 0).sum())
             seen = int(mask.sum())
             score[pose] = round(20.0 * seen * small**2 / max(1, whole)) / 20.0, seen
         found[name] = max(score, key=lambda pose: score[pose])
@@ -193,21 +193,21 @@ def make(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argpars
 
 def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     """One row per person and judged pose: {t_star, person, pose, pixels, iou, first, others}."""
-    made = make(shot, scene, run, t_star, args)
+    take = make(shot, scene, run, t_star, args)
     found: list[dict[str, Any]] = []
-    for name, of in made.masks.items():
+    for name, of in take.masks.items():
         for pose, mask in of.items():
-            if pose == made.lassoed[name] or mask.sum() < LEAST:
+            if pose == take.lassoed[name] or mask.sum() < LEAST:
                 continue
             row = {"t_star": t_star, "person": name, "pose": pose, "pixels": int(mask.sum())}
-            found.append({**row, "iou": round(overlap(made.matte(name, pose), mask), 4), **made.seconds})
+            found.append({**row, "iou": round(overlap(take.matte(name, pose), mask), 4), **take.seconds})
     return found
 
 
 def table(found: dict[str, list[dict[str, Any]]]) -> list[str]:
     """Mean and worst intersection over union, and seconds, by scene and person, in Markdown."""
     lines = [
-        "| scene | person | poses | mean | worst | first matte, s | others, s |",
+        "| scene | person | poses | mean | worst | first matte, s | later mattes, s |",
         "|---|---|---:|---:|---:|---:|---:|",
     ]
     for scene, rows in found.items():
@@ -220,17 +220,26 @@ def table(found: dict[str, list[dict[str, Any]]]) -> list[str]:
 
 def _cells(rows: Sequence[dict[str, Any]]) -> str:
     overlaps = [row["iou"] for row in rows]
-    first, others = (statistics.fmean(row[name] for row in rows) for name in ("first", "others"))
-    return f"{len(rows)} | {statistics.fmean(overlaps):.3f} | {min(overlaps):.3f} | {first:.1f} | {others:.2f}"
+    first, later = (statistics.fmean(row[name] for row in rows) for name in ("first", "others"))
+    return f"{len(rows)} | {statistics.fmean(overlaps):.3f} | {min(overlaps):.3f} | {first:.1f} | {later:.2f}"
 
 
 def matte_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of every benchmark that lassoes people in synthetic scenes."""
     scene_arguments(parser)
-    parser.add_argument("--seed", type=int, default=0, help="of the training")
-    parser.add_argument("--corner", type=float, default=8.0, help="pixels of outline between two corners of a lasso")
-    parser.add_argument("--sloppy", type=float, default=3.0, help="pixels by which a corner may be off the outline")
-    parser.add_argument("--lasso-at", choices=("most", "t-star"), default="most", help="which frame of the take")
+    parser.add_argument("--seed", type=int, default=0, help="training seed")
+    parser.add_argument(
+        "--corner", type=float, default=8.0, help="distance in pixels along the outline between two corners of a lasso"
+    )
+    parser.add_argument(
+        "--sloppy", type=float, default=3.0, help="largest distance in pixels of a corner from the outline"
+    )
+    parser.add_argument(
+        "--lasso-at",
+        choices=("most", "t-star"),
+        default="most",
+        help="frame in which the lasso is drawn: where most of the person is visible, or t*",
+    )
 
 
 @in_words

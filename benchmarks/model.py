@@ -109,7 +109,7 @@ class Judge:
         """bool [H, W] still pixels."""
         return still_pixels(matte, mover, max(1, round(_MARGIN * self.width)))
 
-    def at_own_time(self) -> list[dict[str, Any]]:
+    def at_frame_time(self) -> list[dict[str, Any]]:
         """S, moving, whole and gradient energy, one row per held-out frame, at its own time."""
         rows = []
         for index, plate in self.images.items():
@@ -231,12 +231,12 @@ class Freezer:
         scene, since = self.trainer.scene, time.process_time()
         frame, frozen = scene.frames[index], self.field(index)
         if frame in self.run.train_frames:
-            made = developed(self.shot, self.run, scene, frame, frozen, self.config, keep=False)
+            instant = developed(self.shot, self.run, scene, frame, frozen, self.config, keep=False)
         else:
             moment = Moment(self.run, scene, frame, motion_mattes(self.shot))
-            made = repaired(frozen, moment, repairs(self.config))
+            instant = repaired(frozen, moment, repairs(self.config))
         self.seconds += time.process_time() - since
-        return made
+        return instant
 
 
 def spread(indices: Sequence[int], count: int) -> list[int]:
@@ -257,7 +257,9 @@ def judged(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge],
     return rows
 
 
-def held(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge], test: list[int]) -> list[dict[str, Any]]:
+def judge_held_out(
+    args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge], test: list[int]
+) -> list[dict[str, Any]]:
     """dB of moving pixels at instants held out of training, one row per held-out frame with moving pixels."""
     rows = []
     for index in spread([i for i in test if bool((judges["small"].matte(i) > 0.75).any())], args.held):
@@ -279,9 +281,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     half, first = len(scene.frames) // 2, nearest_trained(trainer, args.t_star)
     t_stars = [first, nearest_trained(trainer, scene.frames[(first + half) % len(scene.frames)])]
     freezer = Freezer(args, shot, trainer)
-    own, frozen = judges["small"].at_own_time(), judged(args, freezer, judges, t_stars)
-    instants = held(args, freezer, judges, test)
-    figures = {name: mean(own, name) for name in FIGURES if name != "frozen"}
+    in_time, frozen = judges["small"].at_frame_time(), judged(args, freezer, judges, t_stars)
+    instants = judge_held_out(args, freezer, judges, test)
+    figures = {name: mean(in_time, name) for name in FIGURES if name != "frozen"}
     figures["frozen"] = mean(frozen["field"]["small"], "frozen")
     for kind, sizes in frozen.items():
         figures |= {f"{kind}_{s}_{name}": mean(rows, name) for s, rows in sizes.items() for name in OF_FROZEN}
@@ -290,7 +292,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     return {
         "figures": figures, "cpu_seconds": seconds, "develop_cpu_seconds": freezer.seconds,
         "gaussians": len(model.gaussians), "open": len(model.open_rows()),
-        "iterations": trainer.iteration, "sh_degree": model.sh_degree, "t_stars": t_stars, "own": own,
+        "iterations": trainer.iteration, "sh_degree": model.sh_degree, "t_stars": t_stars, "own": in_time,
         "frozen": frozen, "held": instants, "needs": trainer.policy.state(), "config": config_to_json(config),
         "develop_config": dataclasses.asdict(freezer.config),
     }  # fmt: skip
@@ -302,19 +304,28 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shot", type=Path)
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--name", default="model", help="of the result's files")
+    parser.add_argument("--name", default="model", help="name of the result files")
     parser.add_argument("--method", default="auto")
-    parser.add_argument("--run", default="", metavar="NAME", help="train nothing: judge this run of the shot")
+    parser.add_argument("--run", default="", metavar="NAME", help="judge this run of the shot instead of training one")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--phase", type=int, default=0, help="which of every 8 frames are held out; 0 only to report")
-    parser.add_argument("--iterations", type=int, default=0, help="0: the preset's")
-    parser.add_argument("--width", type=int, default=0, help="0: the preset's")
-    parser.add_argument("--t-star", type=int, default=8, help="frame; the other instant is half a clip away")
+    parser.add_argument(
+        "--phase",
+        type=int,
+        default=0,
+        help="offset of the held-out frames, every 8th of the clip; 0 is reserved for reports",
+    )
+    parser.add_argument("--iterations", type=int, default=0, help="0: the value of the preset")
+    parser.add_argument("--width", type=int, default=0, help="0: the value of the preset")
+    parser.add_argument(
+        "--t-star", type=int, default=8, help="first instant as a frame number; the second is half a clip away"
+    )
     parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE")
-    parser.add_argument("--again", action="store_true", help="judge what an earlier call trained")
-    parser.add_argument("--develop", action="store_true", help="develop the instants too")
+    parser.add_argument("--again", action="store_true", help="judge the training of an earlier call")
+    parser.add_argument("--develop", action="store_true", help="also develop the instants")
     parser.add_argument("--develop-set", nargs="*", default=[], metavar="FIELD=VALUE")
-    parser.add_argument("--held", type=int, default=0, metavar="N", help="instants that nobody has seen")
+    parser.add_argument(
+        "--held", type=int, default=0, metavar="N", help="number of instants whose frames are held out of training"
+    )
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     args.results.mkdir(parents=True, exist_ok=True)

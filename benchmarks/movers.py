@@ -23,13 +23,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report.truth import THINGS, TruthScene
+from benchmarks.report.truth import OBJECT_REGIONS, TruthScene
 from benchmarks.sources import in_words, load_source
 from torch_backend.cameras.stored import load_cameras
 from torch_backend.motion.mattes import MOVING, load_motion
 from torch_backend.shot import write_json
 
-MOVERS = ("moving", *(name for name in THINGS if name not in ("glass", "mirror", "wall")))
+MOVERS = ("moving", *(name for name in OBJECT_REGIONS if name not in ("glass", "mirror", "wall")))
 """Regions of truth that mattes should mark."""
 LEAST = 50
 """Least pixels of a thing for a frame to count in its worst recall."""
@@ -91,7 +91,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
     parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
-    parser.add_argument("--margin", type=int, default=1, help="pixels around what moves that may be marked, too")
+    parser.add_argument(
+        "--margin",
+        type=int,
+        default=1,
+        help="tolerance in pixels: marks this close to a moving object are not counted as errors",
+    )
     args = parser.parse_args(argv)
     for folder in args.scenes:
         truth = load_source(f"{args.cameras}:{folder.absolute()}", args.results.absolute())

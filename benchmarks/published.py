@@ -73,11 +73,11 @@ def fitted(pixels: Picture, size: tuple[int, int]) -> Picture:
 
 def compared(picture: Picture, plate: Picture) -> dict[str, float]:
     """`FIGURES` of a frozen frame against the plate of its pose."""
-    one, other = (from_numpy(p).float() / 255.0 for p in (picture, plate))
+    one, second = (from_numpy(p).float() / 255.0 for p in (picture, plate))
     return {
-        "whole": psnr_of(float((one - other).double().square().mean())),
-        "best_90": best_share_psnr(one, other),
-        "gradient": gradient_magnitude(one) / max(gradient_magnitude(other), 1e-9),
+        "whole": psnr_of(float((one - second).double().square().mean())),
+        "best_90": best_share_psnr(one, second),
+        "gradient": gradient_magnitude(one) / max(gradient_magnitude(second), 1e-9),
     }
 
 
@@ -120,13 +120,20 @@ def judged(shot: Shot, take: str, clip: Path, videos: Sequence[Path], half: str)
 @in_words
 def main(argv: Sequence[str] | None = None) -> None:
     """Prints a row for the take, its Gaussians alone and each video."""
-    parser = argparse.ArgumentParser(description="Our frozen frames beside published ones of the same clip.")
+    parser = argparse.ArgumentParser(description="Compares our frozen frames with published ones of the same clip.")
     parser.add_argument("shot", type=Path)
     parser.add_argument("take")
-    parser.add_argument("clip", type=Path, help="the video that the shot was imported from")
-    parser.add_argument("videos", type=Path, nargs="+", help="frozen frames of it, one for each of its frames")
-    parser.add_argument("--half", choices=("left", "right"), default="", help="where in the videos the frozen frame is")
-    parser.add_argument("--results", type=Path, help="JSON file of the figures")
+    parser.add_argument("clip", type=Path, help="video from which the shot was imported")
+    parser.add_argument(
+        "videos", type=Path, nargs="+", help="videos of published frozen frames, one frame per frame of the clip"
+    )
+    parser.add_argument(
+        "--half",
+        choices=("left", "right"),
+        default="",
+        help="half of the video picture that shows the frozen frame (default: all of it)",
+    )
+    parser.add_argument("--results", type=Path, help="JSON file to write the figures to")
     args = parser.parse_args(argv)
     found = judged(Shot.open(args.shot), args.take, args.clip, args.videos, args.half)
     for name, row in found.items():

@@ -236,17 +236,17 @@ def _arguments() -> argparse.Namespace:
         type=int,
         nargs="+",
         default=sorted({1, os.cpu_count() or 1}),
-        help="of the CPU body; torch (reference, peers) gets the most of them",
+        help="threads of the CPU body; torch (reference, peers) uses the largest number",
     )
-    parser.add_argument("--reference", action="store_true", help="time the torch reference in float32 too (slow)")
+    parser.add_argument("--reference", action="store_true", help="also time the torch reference in float32 (slow)")
     parser.add_argument(
         "--peer",
         action="append",
         default=[],
         metavar="MODULE",
-        help="time this peer too, e.g. benchmarks.peers.gsplat; may be given again",
+        help="also time this peer, e.g. benchmarks.peers.gsplat; may be repeated",
     )
-    parser.add_argument("--json", type=pathlib.Path, metavar="FILE", help="write all figures there as well")
+    parser.add_argument("--json", type=pathlib.Path, metavar="FILE", help="also write all figures to this JSON file")
     arguments = parser.parse_args()
     unknown = [w for w in arguments.workloads if w not in WORKLOADS]
     if unknown:

@@ -157,7 +157,7 @@ def _image(width: int, height: int) -> Callable[[bool], Scene]:
     return lambda small: cloud(60, width, height, with_depth=True)
 
 
-def _nowhere(small: bool) -> Scene:
+def _behind_the_camera(small: bool) -> Scene:
     scene = cloud(50, 20, 12, with_depth=True)
     scene.tensors["means"][:, 2] = -3.0
     return scene
@@ -194,10 +194,10 @@ def scaled_world(factor: float) -> Callable[[bool], Scene]:
 def _far_from_the_origin(small: bool) -> Scene:
     """World and camera 1400 units from the origin, where float32 resolves positions to 3e-5 units, or 4e-4 px."""
     scene = cloud(60, 32, 24, seed=15)
-    away = torch.tensor([1000.0, -500.0, 800.0]).double()
-    scene.tensors["means"] += away
+    offset = torch.tensor([1000.0, -500.0, 800.0]).double()
+    scene.tensors["means"] += offset
     view = scene.tensors["viewmats"][0]
-    view[:3, 3] -= view[:3, :3] @ away
+    view[:3, 3] -= view[:3, :3] @ offset
     return scene
 
 
@@ -270,7 +270,7 @@ CASES: dict[str, Case] = {
     "image of 17 x 1": Case(_image(17, 1)),
     "image of 1 x 40": Case(_image(1, 40)),
     "no Gaussians": Case(lambda small: cloud(0, 20, 12, with_depth=True)),
-    "nothing in view": Case(_nowhere),
+    "nothing in view": Case(_behind_the_camera),
     "no cameras": Case(_cameras(0)),
     "three cameras": Case(_cameras(3)),
     "principal point at a corner": Case(_principal_point(3.0, 20.0)),

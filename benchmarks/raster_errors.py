@@ -109,8 +109,8 @@ def assert_gradients(grads: dict[str, Tensor], truth: dict[str, Tensor], bound: 
 
 def on_host(out: RasterOutput) -> RasterOutput:
     """The images copied to the CPU."""
-    held: dict[str, Any] = {one.name: getattr(out, one.name) for one in dataclasses.fields(out)}
-    moved: dict[str, Any] = {name: None if value is None else value.cpu() for name, value in held.items()}
+    arrays: dict[str, Any] = {one.name: getattr(out, one.name) for one in dataclasses.fields(out)}
+    moved: dict[str, Any] = {name: None if value is None else value.cpu() for name, value in arrays.items()}
     return RasterOutput(**moved)
 
 

@@ -35,16 +35,19 @@ class Set:
     def on(cls, place: NDArray[np.float64]) -> Set:
         """A ball resting on a point [3], z up, with its lamp."""
         n = np.arange(SAMPLES) + 0.5
-        away, turn = LAMP * np.sqrt(n / SAMPLES), n * np.pi * (3.0 - np.sqrt(5.0))  # sunflower spiral for even spacing
-        disc = np.stack([away * np.cos(turn), away * np.sin(turn), np.zeros(SAMPLES)], axis=1)
+        radius, turn = (
+            LAMP * np.sqrt(n / SAMPLES),
+            n * np.pi * (3.0 - np.sqrt(5.0)),
+        )  # sunflower spiral for even spacing
+        disc = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros(SAMPLES)], axis=1)
         ball = place + np.array([0.0, 0.0, RADIUS])
         return cls(ball, ball + TO_LAMP + disc)
 
     def stops(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.bool_]:
         """bool [...]: whether the ball blocks the segment between points `begin` and `end`, each [..., 3]."""
-        along, off = end - begin, self.ball - begin
-        share = np.clip((off * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-20), 0.0, 1.0)
-        return np.asarray(np.linalg.norm(share[..., None] * along - off, axis=-1) < RADIUS)
+        along, offset = end - begin, self.ball - begin
+        share = np.clip((offset * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-20), 0.0, 1.0)
+        return np.asarray(np.linalg.norm(share[..., None] * along - offset, axis=-1) < RADIUS)
 
 
 def places_of(truth: RayScene, view: View) -> list[NDArray[np.float64]]:

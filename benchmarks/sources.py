@@ -74,8 +74,8 @@ class SyntheticTruth:
         self.t_stars, self._poses = list(self.scene.t_stars), list(self.scene.poses)
         steps = np.diff(self._poses)
         self.fps = self.scene.fps / float(steps[0]) if len(steps) and (steps == steps[0]).all() else 0.0
-        made = {name: self.scene.info[name] for name in ("version", "key") if name in self.scene.info}
-        self.key = content_key(made, read_json(self.shot.solve / "cameras.json"))
+        identity = {name: self.scene.info[name] for name in ("version", "key") if name in self.scene.info}
+        self.key = content_key(identity, read_json(self.shot.solve / "cameras.json"))
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
         """All poses with truth and a camera."""
@@ -89,8 +89,8 @@ class SyntheticTruth:
         """Regions by truth (seen at t* or not, moving or static) and a hard scene's things, by nearest pixel."""
         regions = self._pixels.regions(self.scene.regions(t_star, pose))
         seen, moving = (_nearest(mask, width, height) for mask in (regions.seen, regions.moving))
-        things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
-        return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving, **things}
+        objects = {name: _nearest(mask, width, height) for name, mask in regions.objects.items()}
+        return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving, **objects}
 
     @property
     def metres_per_unit(self) -> float:
@@ -120,8 +120,8 @@ class SyntheticTruth:
         """`moving` and `static` in the clip's own frame and a hard scene's things, by truth; by nearest pixel."""
         regions = self._pixels.regions(self.scene.frame_regions(frame))
         moving = _nearest(regions.moving, width, height)
-        things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
-        return {"moving": moving, "static": ~moving, **things}
+        objects = {name: _nearest(mask, width, height) for name, mask in regions.objects.items()}
+        return {"moving": moving, "static": ~moving, **objects}
 
 
 def load_synthetic(folder: Path, results: Path, cameras: str = "exact") -> SyntheticTruth:

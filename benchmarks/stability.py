@@ -123,7 +123,7 @@ def train_once(scene: Scene, config: TrainConfig) -> Outcome:
 def table(outcomes: Sequence[Outcome]) -> list[str]:
     """Markdown table with a row per method."""
     lines = [
-        "| method | runs | PSNR, dB: mean | std | min | max | diverged | not finite | steps left out | warnings | s |",
+        "| method | runs | PSNR, dB: mean | std | min | max | diverged | not finite | skipped steps | warnings | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for method in dict.fromkeys(outcome.method for outcome in outcomes):
@@ -151,9 +151,9 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(default_threads())
     if (args.shot / "scene.json").is_file():
-        made = SyntheticScene.load(args.shot)
-        place = args.results.absolute().parent / f"{made.size}-{made.name}-exact{SHOT_SUFFIX}"
-        shot = exact_shot(made, place, Warnings())
+        synthetic = SyntheticScene.load(args.shot)
+        place = args.results.absolute().parent / f"{synthetic.size}-{synthetic.name}-exact{SHOT_SUFFIX}"
+        shot = exact_shot(synthetic, place, Warnings())
     else:
         shot = Shot.open(args.shot)
     scene, kept = load_scene(shot), read_json(args.results)["runs"] if args.results.is_file() else {}

@@ -47,7 +47,7 @@ PLATES = 2
 """Least number of plates that must see a point of the true surface."""
 
 
-def off_truth(places: NDArray[np.float64], truth: RayScene, views: Sequence[View]) -> NDArray[np.float64]:
+def distance_from_truth(places: NDArray[np.float64], truth: RayScene, views: Sequence[View]) -> NDArray[np.float64]:
     """[V] distance from the true surface, relative to its depth; inf if fewer than `PLATES` views see the true point.
 
     Args:
@@ -66,10 +66,10 @@ def off_truth(places: NDArray[np.float64], truth: RayScene, views: Sequence[View
     return np.where(count >= PLATES, np.linalg.norm(places - found, axis=1) / least, np.inf)
 
 
-def figures(off: NDArray[np.float64]) -> dict[str, float]:
+def figures(distances: NDArray[np.float64]) -> dict[str, float]:
     """Number of points, share seen by plates; of these, median and 90th percentile of distance, share `BEYOND`."""
-    seen = off[np.isfinite(off)]
-    row = {"points": float(len(off)), "seen": len(seen) / max(len(off), 1)}
+    seen = distances[np.isfinite(distances)]
+    row = {"points": float(len(distances)), "seen": len(seen) / max(len(distances), 1)}
     if len(seen):
         row |= {"median": float(np.median(seen)), "ninth tenth": float(np.quantile(seen, 0.9))}
         row["beyond"] = float((seen > BEYOND).mean())
@@ -103,7 +103,7 @@ def judge(truth: SyntheticTruth, run: str, t_star: int, every: int) -> dict[str,
     for kind, of in (("at pixels", shown), ("frames", points)):
         known = np.isfinite(of[:, 0])
         parts |= {f"room, {kind}": of[~moves & known], f"people, {kind}": of[moves & known]}
-    rows = {name: figures(off_truth(of, standing, views)) for name, of in parts.items()}
+    rows = {name: figures(distance_from_truth(of, standing, views)) for name, of in parts.items()}
     return rows | {"shadow": shadows(surface, standing, views)}
 
 
@@ -139,9 +139,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of the trainings")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="training seeds")
     args = parser.parse_args(argv)
-    rows = ["| scene | seed | t* | part | points | seen by two plates | median, % | ninth tenth, % | beyond 1 %, % |"]
+    rows = [
+        "| scene | seed | t* | part | points | seen by two plates | median, % | 90th percentile, % | beyond 1 %, % |"
+    ]
     rows.append("|---|---:|---:|---|---:|---:|---:|---:|---:|")
     ends = [""]
     if args.cameras != "exact":

@@ -158,7 +158,13 @@ def main() -> None:
     parser.add_argument("--preset", default="preview")
     parser.add_argument("--iterations", type=int, default=0)
     parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--at", type=float, nargs=2, default=(0.15, 0.7), help="shares of the run that are measured")
+    parser.add_argument(
+        "--at",
+        type=float,
+        nargs=2,
+        default=(0.15, 0.7),
+        help="positions in the run at which steps are measured, as shares of it",
+    )
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--json", metavar="FILE")
     args = parser.parse_args()

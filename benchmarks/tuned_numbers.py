@@ -151,8 +151,8 @@ def numbers(freeze: Path) -> list[Number]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; returns an exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--list", action="store_true", help="every tuned number")
-    parser.add_argument("--all", action="store_true", help="every number")
+    parser.add_argument("--list", action="store_true", help="list every tuned number")
+    parser.add_argument("--all", action="store_true", help="list every number")
     args = parser.parse_args(argv)
     found = numbers(Path(__file__).resolve().parents[1] / "torch_backend" / "freeze")
     for each in found if args.list or args.all else ():
@@ -161,7 +161,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     tuned = Counter(each.file for each in found if each.kind == "tuned")
     print("\n".join(f"{count:4d} {file}" for file, count in tuned.items()))
     for name in sorted(UNTUNED.keys() - {f"{each.file}:{each.name}" for each in found}):
-        print(f"There is no {name} any more.")
+        print(f"{name} no longer exists.")
     kinds = Counter(each.kind for each in found)
     print("Tuned: {}. Not tuned: {}.".format(
         kinds.pop("tuned", 0), ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()))

@@ -77,10 +77,10 @@ def owners(scene: SyntheticScene, person: str, base: int, instant: int, pose: in
     return np.where(shows[0], BASE, np.where(shows[1], INSTANT, UNKNOWN)).astype(np.uint8).reshape(view.height, -1)
 
 
-def _same(one: Hits, other: Hits) -> Mask:
+def _same(one: Hits, second: Hits) -> Mask:
     """[R] whether rays hit the same surface, or nothing, in two scenes."""
-    near = np.abs(np.where(one.face < 0, 0.0, one.distance) - np.where(other.face < 0, 0.0, other.distance))
-    return (one.face == other.face) & (near < SAME_METRES)
+    near = np.abs(np.where(one.face < 0, 0.0, one.distance) - np.where(second.face < 0, 0.0, second.distance))
+    return (one.face == second.face) & (near < SAME_METRES)
 
 
 def rendered(scene: SyntheticScene, person: str, base: int, instant: int, args: argparse.Namespace) -> Path:
@@ -112,8 +112,8 @@ def judge(
     """One row per pose: {person, base, instant, pose, regions: {name: [pixels, squared error combined, separate]}}."""
     base, instant = pair
     name = f"two{base}-{instant}-{person}"
-    things = f"{person}={takes[instant].root.name}"
-    combine(shot, CombineParams(base=takes[base].root.name, things=things, take=name), Log())
+    replaced = f"{person}={takes[instant].root.name}"
+    combine(shot, CombineParams(base=takes[base].root.name, things=replaced, take=name), Log())
     folder, pictures = TakeFolder(shot.take(name)), rendered(scene, person, base, instant, args)
     rows: list[dict[str, Any]] = []
     for pose in scene.poses:
@@ -123,31 +123,31 @@ def judge(
         shown, one, two = (picture_of(each, pose) for each in (folder, takes[base], takes[instant]))
         write_png(pictures / f"shown-{pose:06d}.png", np.concatenate([truth, shown, one, two], axis=1))
         error = _squares(shown, truth)
-        apart = np.where(
+        separate = np.where(
             owner == BASE, _squares(one, scene.truth(base, pose)), _squares(two, scene.truth(instant, pose))
         )
         regions = {"whole": owner != UNKNOWN, "person": owner == INSTANT, "unknown": owner == UNKNOWN}
-        found = {key: [int(of.sum()), float(error[of].sum()), float(apart[of].sum())] for key, of in regions.items()}
+        found = {key: [int(of.sum()), float(error[of].sum()), float(separate[of].sum())] for key, of in regions.items()}
         rows.append({"person": person, "base": base, "instant": instant, "pose": pose, "regions": found})
     return rows
 
 
-def _squares(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _squares(one: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float64]:
     """[H, W] mean squared difference of two pictures, in 0..1."""
-    return np.square((one.astype(np.float64) - other) / 255.0).mean(-1)
+    return np.square((one.astype(np.float64) - second) / 255.0).mean(-1)
 
 
 def figures(rows: Sequence[dict[str, Any]], region: str) -> tuple[float, float] | None:
     """PSNR (combined, separate takes) of a region over the pixels of all poses; None if it is empty."""
-    pixels, error, apart = np.sum([row["regions"][region] for row in rows], axis=0)
-    return (psnr_of(error / pixels), psnr_of(apart / pixels)) if pixels else None
+    pixels, error, separate = np.sum([row["regions"][region] for row in rows], axis=0)
+    return (psnr_of(error / pixels), psnr_of(separate / pixels)) if pixels else None
 
 
 def table(found: dict[str, list[dict[str, Any]]]) -> list[str]:
     """Figures by scene, pair and person, in Markdown."""
     lines = [
-        "| scene | base, instant | person | matte IoU | whole: apart, combined, lost | person: apart, combined, lost "
-        "| unknown: share, combined |",
+        "| scene | base, instant | person | matte IoU | whole: separate, combined, loss "
+        "| person: separate, combined, loss | unknown: share, combined |",
         "|---|---|---|---:|---:|---:|---:|",
     ]
     for scene, rows in found.items():
@@ -171,18 +171,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     matte_arguments(parser)
-    parser.add_argument("--bpy", help="Python of Blender's module, which renders the truth")
+    parser.add_argument("--bpy", help="Python with bpy, for rendering the truth")
     args = parser.parse_args(argv)
     found: dict[str, list[dict[str, Any]]] = {}
     for truth, runs in trained_scenes(args, [args.seed]):
         scene, run = truth.scene, runs[args.seed]
-        made = {t: make(truth.shot, scene, run, t, args) for t in args.t_star or truth.t_stars}
-        takes = {t: of.folder for t, of in made.items()}
+        instants = {t: make(truth.shot, scene, run, t, args) for t in args.t_star or truth.t_stars}
+        takes = {t: of.folder for t, of in instants.items()}
         rows = found[truth.name] = []
         for pair in itertools.permutations(takes, 2):
-            for person in [name for name in made[pair[0]].masks if name in made[pair[1]].masks]:
+            for person in [name for name in instants[pair[0]].masks if name in instants[pair[1]].masks]:
                 for row in judge(truth.shot, scene, person, takes, pair, args):
-                    each = [(made[t].masks[person][row["pose"]], made[t].matte(person, row["pose"])) for t in pair]
+                    each = [
+                        (instants[t].masks[person][row["pose"]], instants[t].matte(person, row["pose"])) for t in pair
+                    ]
                     iou = [overlap(matte, mask) for mask, matte in each if mask.sum() >= LEAST]
                     rows.append({**row, "iou": statistics.fmean(iou) if iou else 1.0})
         write_json(args.results / f"two-instants-{truth.name.replace(' ', '-')}.json", {"version": 1, "rows": rows})

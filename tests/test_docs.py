@@ -29,7 +29,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_links_and_pictures_are_there(page: Path):
+def test_links_and_pictures_exist(page: Path):
     broken = []
     for target in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
         if re.match(r"[a-z]+:", target):
@@ -41,7 +41,7 @@ def test_links_and_pictures_are_there(page: Path):
     assert not broken
 
 
-def test_what_contributors_are_sent_to_is_there():
+def test_contributor_links_exist():
     """Every file and folder between backticks; `NAME` stands for the reader's own name."""
     page = text_of(ROOT / "CONTRIBUTING.md")
     named = [word for word in re.findall(r"`([^`\n]+)`", page) if "NAME" not in word]
@@ -51,7 +51,7 @@ def test_what_contributors_are_sent_to_is_there():
     assert not sorted(path for path in {*paths, *run} if not (ROOT / path).exists())
 
 
-def test_every_test_that_a_page_names_is_there():
+def test_every_documented_test_exists():
     """Notations: `file.py::test`, `::test` of the previous file in the row, or `test` alone."""
     tests = "".join(text_of(path) for path in (ROOT / "tests").rglob("test_*.py"))
     for page in PAGES:
@@ -62,7 +62,7 @@ def test_every_test_that_a_page_names_is_there():
             assert f"def {name}" in tests, f"{page.name}: {name}"
 
 
-def test_the_reference_is_made_of_the_tables():
+def test_reference_matches_the_option_tables():
     page = reference.PAGE.read_text(encoding="utf-8")
     assert page == reference.text(), "run `python3 tools/reference.py`"
 

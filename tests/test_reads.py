@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LOOKS = {"open_regular", "open_arrays", "regular_file"}
 OPENS = {"ImageInput.open", "ImageBuf", "images.load", "av.open", "safe_open", "np.load", "np.fromfile", "cv2.imread"}
 """Ends of the names of functions that open a file by its path, or read an open file."""
-OWN = {
+TRUSTED_READS = {
     "torch_backend/kernel_text.py": "the package's own files",
     "torch_backend/contract/hosts.py": "the package's own files",
     "torch_backend/contract/processes.py": "/proc and /etc",
@@ -80,8 +80,10 @@ def modules() -> list[Path]:
 @pytest.mark.parametrize("path", modules(), ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_files_are_looked_at_before_they_are_read(path: Path):
     where = path.relative_to(ROOT).as_posix()
-    if where not in OWN:
-        found = [call for scope, call in unseen(path.read_text(encoding="utf-8")) if f"{where}:{scope}" not in OWN]
+    if where not in TRUSTED_READS:
+        found = [
+            call for scope, call in unseen(path.read_text(encoding="utf-8")) if f"{where}:{scope}" not in TRUSTED_READS
+        ]
         assert not found, "ask `regular_file`, `open_regular` or `open_arrays` of the contract first"
 
 

@@ -30,9 +30,9 @@ def parameters(tree: ast.AST) -> Iterator[tuple[str, str, str]]:
     missing."""
     for node in ast.walk(tree):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            told = node.args
-            stars = [one for one in (told.vararg, told.kwarg) if one is not None]
-            for one in [*told.posonlyargs, *told.args, *told.kwonlyargs, *stars]:
+            arguments = node.args
+            stars = [one for one in (arguments.vararg, arguments.kwarg) if one is not None]
+            for one in [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, *stars]:
                 if one.arg not in ("self", "cls"):
                     yield node.name, one.arg, ast.unparse(one.annotation) if one.annotation is not None else ""
 
@@ -53,14 +53,14 @@ def addon_parameters() -> list[tuple[str, str]]:
 
 
 def test_hardly_a_parameter_of_the_addon_has_an_open_type():
-    told = addon_parameters()
-    assert len(told) > 900
-    assert sum(is_open(kind) for _, kind in told) < MOST * len(told)
+    found = addon_parameters()
+    assert len(found) > 900
+    assert sum(is_open(kind) for _, kind in found) < MOST * len(found)
 
 
 def test_every_open_parameter_of_the_addon_has_a_reason():
-    told = addon_parameters()
-    assert {name for name, kind in told if is_open(kind) and kind not in RECORDS} == set(OPEN)
+    found = addon_parameters()
+    assert {name for name, kind in found if is_open(kind) and kind not in RECORDS} == set(OPEN)
 
 
 def annotated_calls(tree: ast.AST) -> list[int]:
@@ -69,7 +69,7 @@ def annotated_calls(tree: ast.AST) -> list[int]:
     return [n.lineno for n in found if any(isinstance(part, ast.Call) for part in ast.walk(n.annotation))]
 
 
-def test_properties_of_the_addon_are_assigned_so_that_their_type_is_known():
+def test_addon_properties_are_assigned_with_known_types():
     """`splannequin_addon/properties.py` explains how."""
     for path in sorted((ROOT / "splannequin_addon").rglob("*.py")):
         assert not annotated_calls(ast.parse(path.read_text(encoding="utf-8"))), path

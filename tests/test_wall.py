@@ -133,13 +133,13 @@ def imported(path: Path) -> list[tuple[int, str]]:
 
 
 LAYOUT = {
-    value
-    for name, told in vars(shot_folder).items()
+    name_of_file
+    for name, value in vars(shot_folder).items()
     if name.endswith(("_FILE", "_FILES", "_FOLDER", "_LOG", "_SUFFIX"))
-    for value in (told if isinstance(told, tuple) else (told,))
+    for name_of_file in (value if isinstance(value, tuple) else (value,))
 }
 """Names in a shot folder, as spelled in the contract."""
-OTHER_FOLDERS = {
+FOREIGN_NAMES = {
     ("splannequin_addon/process/environment.py", "summary.json"),  # of the launcher, in an environment
     ("splannequin_addon/process/environment.py", ".splannequin"),
     ("torch_backend/cameras/imported.py", "colmap/sparse/0"),  # of another program
@@ -225,7 +225,7 @@ def unplaced_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("folder", ["splannequin_addon", "torch_backend", "benchmarks", "launcher"])
-def test_no_python_is_started_that_takes_modules_from_where_it_stands(folder: str):
+def test_no_python_is_started_without_safe_path(folder: str):
     for path in sources(folder) if (ROOT / folder).is_dir() else [ROOT / folder]:
         wrong = list(unsafe_children(read(path)))
         if folder in ("splannequin_addon", "torch_backend"):
@@ -327,7 +327,7 @@ def test_only_the_contract_spells_the_layout_of_a_shot():
     for path in [*sources("splannequin_addon"), *sources("torch_backend")]:
         file = path.relative_to(ROOT).as_posix()
         found = layout_names(read(path)) if contract not in path.parents else ()
-        wrong += [f"{file}:{line}: {name}" for line, name in found if (file, name) not in OTHER_FOLDERS]
+        wrong += [f"{file}:{line}: {name}" for line, name in found if (file, name) not in FOREIGN_NAMES]
     assert not wrong, "ask contract.ShotFolder, RunFolder or TakeFolder for these paths"
 
 
@@ -343,7 +343,7 @@ def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
         return found
 
     beyond = {name: reached(name) for name in arrows}
-    groups = {frozenset(other for other in beyond[name] if name in beyond[other]) for name in arrows}
+    groups = {frozenset(reachable for reachable in beyond[name] if name in beyond[reachable]) for name in arrows}
     return sorted(sorted(group) for group in groups if group)
 
 
@@ -352,7 +352,7 @@ def test_the_scan_sees_a_circle():
     assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
 
 
-def test_only_one_file_of_the_addon_imports_others_for_the_type_checker():
+def test_only_one_addon_file_imports_for_type_checking():
     """Every file may import bpy's types. A room that needs data of a later room gets it through `access`."""
 
     for_types = {
@@ -385,29 +385,29 @@ def addon_modules() -> dict[str, set[str]]:
 
 def level(module: str, arrows: dict[str, set[str]]) -> int:
     """Length of the longest chain of imports that starts with this module, which counts as one."""
-    return 1 + max((level(other, arrows) for other in arrows[module]), default=0)
+    return 1 + max((level(imported_module, arrows) for imported_module in arrows[module]), default=0)
 
 
 def backwards(arrows: dict[str, set[str]]) -> list[str]:
     """Imports from a room to one that does not come before it."""
     order = {room: place for place, room in enumerate(ROOMS)}
     wrong = []
-    for module, others in arrows.items():
-        here = module.partition(".")[0]
-        for other in sorted(others):
-            there = other.partition(".")[0]
-            if here != there and order[there] >= order[here]:
-                wrong.append(f"{module} imports {other}")
-            if other.endswith(".step") and here != "registration":
-                wrong.append(f"{module} imports {other}, which only the registration does")
+    for module, targets in arrows.items():
+        source_room = module.partition(".")[0]
+        for target in sorted(targets):
+            target_room = target.partition(".")[0]
+            if source_room != target_room and order[target_room] >= order[source_room]:
+                wrong.append(f"{module} imports {target}")
+            if target.endswith(".step") and source_room != "registration":
+                wrong.append(f"{module} imports {target}, which only the registration does")
     return wrong
 
 
-def test_no_modules_of_the_addon_import_each_other():
+def test_addon_modules_have_no_import_cycles():
     assert circles(addon_modules()) == []
 
 
-def test_no_file_of_the_addon_stands_on_a_high_tower_of_imports():
+def test_addon_import_depth_is_bounded():
     arrows = addon_modules()
     assert len(arrows) > 60
     high = {module: level(module, arrows) for module in arrows}
@@ -462,16 +462,16 @@ def part_of(name: str, package: str) -> str:
 
 
 @pytest.mark.parametrize("package", [*packages("launcher"), *packages("torch_backend"), *packages("benchmarks")])
-def test_no_files_and_folders_of_a_package_import_each_other(package: str):
+def test_packages_have_no_import_cycles(package: str):
     """At any depth, and also for type names: a file that names another's class depends on it."""
     arrows: dict[str, set[str]] = {}
     for path in sources(package.replace(".", "/")):
         module = [*package_of(path), *([] if path.stem == "__init__" else [path.stem])]
-        own = part_of(".".join(module), package)
-        if own:
+        part = part_of(".".join(module), package)
+        if part:
             names = (part_of(name, package) for _, name in imported(path))
-            arrows.setdefault(own, set()).update(names)
-    arrows = {own: {name for name in names if name in arrows and name != own} for own, names in arrows.items()}
+            arrows.setdefault(part, set()).update(names)
+    arrows = {part: {name for name in names if name in arrows and name != part} for part, names in arrows.items()}
     assert circles(arrows) == []
 
 

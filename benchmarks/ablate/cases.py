@@ -48,11 +48,11 @@ def scene_case(folder: Path, seed: int, results: Path, lent: Path | None = None)
     """
     source = f"exact:{folder.absolute()}"
     name = f"{folder.parent.name}-{folder.name}"
-    own = results / "shots" / f"{name}-exact.splannequin"
-    theirs = None if lent is None else lent / "shots" / own.name
-    if theirs is not None and theirs.is_dir() and not (own / f"copied-{seed}").is_file():
-        shutil.copytree(theirs, own, dirs_exist_ok=True)
-        (own / f"copied-{seed}").touch()
+    trained_shot = results / "shots" / f"{name}-exact.splannequin"
+    theirs = None if lent is None else lent / "shots" / trained_shot.name
+    if theirs is not None and theirs.is_dir() and not (trained_shot / f"copied-{seed}").is_file():
+        shutil.copytree(theirs, trained_shot, dirs_exist_ok=True)
+        (trained_shot / f"copied-{seed}").touch()
     truth = load_source(source, results)
     run = trained(truth, source, seed, ITERATIONS, GAUSSIANS)
     width = load_run(truth.shot, run, torch.device("cpu")).width

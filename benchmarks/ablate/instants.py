@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from benchmarks.ablate.switches import MAKER, STAGES, of_stage, replaced, switched_off
+from benchmarks.ablate.switches import MAKER, STAGES, of_stage, replaced, rules_disabled
 from benchmarks.detail_clip import DetailClip
 from torch_backend.freeze.frozen import FrozenGaussians
 from torch_backend.freeze.instant import instants as developed_instants
@@ -41,54 +41,54 @@ class Instants:
         self.clip, self.t_star, self.folder = clip, t_star, folder
         self._kept: dict[str, tuple[Any, float]] = {}
 
-    def make(self, off: frozenset[str]) -> Instant:
-        """The instant with rules `off`."""
+    def make(self, disabled: frozenset[str]) -> Instant:
+        """The instant with rules `disabled`."""
         seconds: dict[str, float] = {}
         run, scene = self.clip.run, self.clip.scene
         field = self.clip.field(self.t_star)
-        with self._sharing(off, seconds), switched_off(off):
+        with self._sharing(disabled, seconds), rules_disabled(disabled):
             config = developed_instants.config_for(run)
-            made = developed_instants._make(self.clip.shot, run, scene, self.t_star, field, config)  # pyright: ignore[reportPrivateUsage]
-        return Instant(made, digest(made), seconds)
+            frozen = developed_instants._make(self.clip.shot, run, scene, self.t_star, field, config)  # pyright: ignore[reportPrivateUsage]
+        return Instant(frozen, digest(frozen), seconds)
 
     @contextlib.contextmanager
-    def _sharing(self, off: frozenset[str], seconds: dict[str, float]) -> Iterator[None]:
+    def _sharing(self, disabled: frozenset[str], seconds: dict[str, float]) -> Iterator[None]:
         """Context in which a step called again with the same input returns its cached result."""
         with contextlib.ExitStack() as stack:
             for stage in STAGES:
                 # A step that is off as a whole is replaced on top of this wrapper, and costs nothing.
-                stack.enter_context(replaced(MAKER, stage, self._shared(stage, off, seconds)))
+                stack.enter_context(replaced(MAKER, stage, self._shared(stage, disabled, seconds)))
             yield
 
     def _shared(
-        self, stage: str, off: frozenset[str], seconds: dict[str, float]
+        self, stage: str, disabled: frozenset[str], seconds: dict[str, float]
     ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-        rules = sorted(of_stage(off, stage))
+        rules = sorted(of_stage(disabled, stage))
 
         def wrap(step: Callable[..., Any]) -> Callable[..., Any]:
             def shared(*args: Any, **more: Any) -> Any:
                 key = f"{stage}-{digest([rules, args, more])}"
                 if key not in self._kept:
-                    self._kept[key] = self._made(stage, key, lambda: step(*args, **more))
-                made, took = self._kept[key]
+                    self._kept[key] = self._computed(stage, key, lambda: step(*args, **more))
+                result, took = self._kept[key]
                 seconds[stage] = seconds.get(stage, 0.0) + took
-                return made
+                return result
 
             return shared
 
         return wrap
 
-    def _made(self, stage: str, key: str, make: Callable[[], Any]) -> tuple[Any, float]:
+    def _computed(self, stage: str, key: str, make: Callable[[], Any]) -> tuple[Any, float]:
         """(result of a step, its CPU seconds), read from the folder if it is there."""
         path = None if self.folder is None or stage != "develop" else self.folder / f"{key}.safetensors"
         if path is not None and path.is_file():
             return _load(path)
         since = time.process_time()
-        made = make(), time.process_time() - since
+        computed = make(), time.process_time() - since
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            _save(path, *made)
-        return made
+            _save(path, *computed)
+        return computed
 
 
 def _save(path: Path, frozen: FrozenGaussians, seconds: float) -> None:

@@ -21,7 +21,7 @@ from torch_backend.lens.plate_lens import load_plate_lenses
 
 def variants() -> dict[str, frozenset[str]]:
     """Name -> frame rules that are off: combinations, and each rule that decides whether the own plate is used."""
-    named = {name: off for name, off in COMBINATIONS.items() if off == of_frames(off)}
+    named = {name: disabled for name, disabled in COMBINATIONS.items() if disabled == of_frames(disabled)}
     return named | {f"no {rule.name}": frozenset({rule.name}) for rule in STATE if rule.name in RULES}
 
 
@@ -30,15 +30,15 @@ def judge_masks(case: Case, store: Store) -> None:
     name = Path(case.clip.shot.info().source).stem
     if name not in CLIPS:
         return
-    masks, told = load_masks(name), f"{case.name} masks"
+    masks, case_name = load_masks(name), f"{case.name} masks"
     for t_star in sorted({pair.t_star for pair in masks.pairs}):
-        todo = {name: off for name, off in variants().items() if not store.has(told, t_star, name)}
+        todo = {name: disabled for name, disabled in variants().items() if not store.has(case_name, t_star, name)}
         if todo:
             maker = FrameMaker(case.clip, t_star, Instant(case.clip.frozen(t_star), "", {}))
             pairs = [pair for pair in masks.pairs if pair.t_star == t_star]
             with replaced("composite.compositor", "fillers_of", lambda _: lambda *_: None):  # the fill is not judged
                 for name, row in _judged(maker, masks, pairs, todo).items():
-                    store.save(told, t_star, name, row)
+                    store.save(case_name, t_star, name, row)
 
 
 def _judged(
@@ -51,9 +51,9 @@ def _judged(
     for pair in pairs:
         where = lenses[pair.frame].where(clip.width, clip.height) * scale
         labels = plate_labels(masks.labels(pair), where)
-        for name, off in todo.items():
-            made, decided, _ = maker.make(pair.frame, off)
-            let_go = (made.matte < LET_GO) | (made.primary != pair.frame)
+        for name, disabled in todo.items():
+            composite, decided, _ = maker.make(pair.frame, disabled)
+            let_go = (composite.matte < LET_GO) | (composite.primary != pair.frame)
             counts = count(let_go.numpy(), labels)
             ratios = {"iou": counts.iou, "extra_share": counts.extra_share}
             rows[name].append({"frame": pair.frame, "decision_s": decided, **ratios, **asdict(counts)})

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from benchmarks.ablate.cases import Case
 from benchmarks.ablate.instants import Instant
-from benchmarks.ablate.switches import RULES, detail_config, replaced, switched_off
+from benchmarks.ablate.switches import RULES, detail_config, replaced, rules_disabled
 from benchmarks.detail_clip import DetailClip, View, over
 from benchmarks.detail_figures import Flow, textured, unexplained_flow, unsteadiness
 from benchmarks.detail_flow import LEAST, Pair, Shown, lay_over
@@ -42,25 +42,25 @@ class FrameMaker:
             self.make(frame, frozenset())  # computes the results cached per plate, so that no variant pays for them
         return self._images[frame]
 
-    def _maker(self, off: frozenset[str]) -> Compositor:
-        """A compositor with rules `off`. The cache of plates is kept until a rule that affects it changes."""
-        config = detail_config(off)
-        views = {name for name in off if any(each.module.startswith("views.") for each in RULES[name].switches)}
+    def _maker(self, disabled: frozenset[str]) -> Compositor:
+        """A compositor with rules `disabled`. The cache of plates is kept until a rule that affects it changes."""
+        config = detail_config(disabled)
+        views = {name for name in disabled if any(each.module.startswith("views.") for each in RULES[name].switches)}
         key = config.source_views, views
         if self._compositor is None or self._compositor[0] != key:
             self._compositor = key, Compositor(self.clip.run, self.clip.scene, self.clip.plates, config)
         self._compositor[1].config = config
         return self._compositor[1]
 
-    def make(self, frame: int, off: frozenset[str]) -> tuple[CompositeFrame, float, float]:
-        """(frame with rules `off`, CPU seconds of its decisions, CPU seconds without the Gaussians' render)."""
+    def make(self, frame: int, disabled: frozenset[str]) -> tuple[CompositeFrame, float, float]:
+        """(frame with rules `disabled`, CPU seconds of its decisions, CPU seconds without the Gaussians' render)."""
         clip, image = self.clip, self.image(frame)
         output = OutputFrame(frame, *clip.camera(frame), float(self.t_star), float(frame))
-        spent, compositor = [0.0], self._maker(off)
-        with switched_off(off), timed(spent):
+        spent, compositor = [0.0], self._maker(disabled)
+        with rules_disabled(disabled), timed(spent):
             since = time.process_time()
-            made = compositor.frame(output, self.instant.frozen, image, clip.width, clip.height)
-            return made, spent[0], time.process_time() - since
+            composite = compositor.frame(output, self.instant.frozen, image, clip.width, clip.height)
+            return composite, spent[0], time.process_time() - since
 
 
 @contextmanager
@@ -83,9 +83,9 @@ def timed(spent: list[float]) -> Iterator[None]:
         yield
 
 
-def shown(made: CompositeFrame) -> Tensor:
+def shown(composite: CompositeFrame) -> Tensor:
     """[H, W, 3] a delivered frame over grey, in 0..1."""
-    return over(made.color, made.alpha)
+    return over(composite.color, composite.alpha)
 
 
 def judge(
@@ -115,12 +115,12 @@ def _judge_truth(
         target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
         behind, image = truth.behind(t_star, pose, *size), maker.image(pose)
         developed = psnr_by_region(over(image.color, image.alpha), target, regions)
-        for name, off in variants.items():
-            made, decided, took = maker.make(pose, off)
-            picture = shown(made)
+        for name, disabled in variants.items():
+            composite, decided, took = maker.make(pose, disabled)
+            picture = shown(composite)
             row: Row = {"pose": pose, "developed": developed, "delivered": psnr_by_region(picture, target, regions)}
             row["recalled"] = recall_of(behind, picture, target, regions)
-            rows[name].append(row | {"decision_s": decided, "frame_s": took, "own": float(made.matte.mean())})
+            rows[name].append(row | {"decision_s": decided, "frame_s": took, "own": float(composite.matte.mean())})
     return {name: {"frames": found} for name, found in rows.items()}
 
 
@@ -134,8 +134,8 @@ def _judge_clip(
     rows: dict[str, list[Row]] = {name: [] for name in variants}
     for first, second in pairs:
         laid: tuple[Pair, Tensor] | None = None
-        for name, off in variants.items():
-            a, b = (maker.make(frame, off) for frame in (first, second))
+        for name, disabled in variants.items():
+            a, b = (maker.make(frame, disabled) for frame in (first, second))
             if laid is None:  # frame rules change neither depth nor the correspondence that follows from it
                 laid = _laid(maker, (first, second), (a[0], b[0]))
             pair, still = laid
@@ -146,17 +146,17 @@ def _judge_clip(
 
 
 def _laid(
-    maker: FrameMaker, frames: tuple[int, int], made: tuple[CompositeFrame, CompositeFrame]
+    maker: FrameMaker, frames: tuple[int, int], composites: tuple[CompositeFrame, CompositeFrame]
 ) -> tuple[Pair, Tensor]:
     """(correspondence of two neighbouring frames, bool [H, W] still pixels of the first)."""
     clip, t_star, both = maker.clip, maker.t_star, list[Shown]()
     still: Tensor | None = None
-    for frame, detailed in zip(frames, made, strict=True):
+    for frame, detailed in zip(frames, composites, strict=True):
         image, picture = maker.image(frame), shown(detailed)
         view = View(image, detailed, picture, picture)
-        own, of_t_star = clip.mattes(frame, t_star, view)
+        matte, matte_t_star = clip.mattes(frame, t_star, view)
         still = clip.still(frame, t_star, view) if still is None else still
-        both.append(Shown(frame, {"delivered": detailed.depth}, {"delivered": picture}, own, of_t_star))
+        both.append(Shown(frame, {"delivered": detailed.depth}, {"delivered": picture}, matte, matte_t_star))
     assert still is not None
     return lay_over(clip, both[0], both[1], "delivered"), still
 
@@ -165,9 +165,11 @@ def judge_pair(flow: Flow, pair: Pair, still: Tensor, one: Tensor, two: Tensor, 
     """Figures of two neighbouring frozen frames: error of still pixels, residual flow in pixels, flicker of 255."""
     error = (one - plate).double().square().mean(-1)[still]
     left, judged = unexplained_flow(flow, one, two, pair.places, pair.both), textured(one)
-    stands = pair.moving | pair.still
+    in_region = pair.moving | pair.still
     row: Row = {"still_mse": float(error.mean()) if len(error) else None}
-    row["flicker"] = 255.0 * float(unsteadiness(one, two, pair.places)[stands].mean()) if bool(stands.any()) else None
+    row["flicker"] = (
+        255.0 * float(unsteadiness(one, two, pair.places)[in_region].mean()) if bool(in_region.any()) else None
+    )
     for region, mask in (("moving", pair.moving), ("still", pair.still)):
         values = left[mask & judged]
         enough = len(values) >= LEAST

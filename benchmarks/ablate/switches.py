@@ -50,7 +50,7 @@ class Rule:
 
     name: str
     """Short name, as in the table."""
-    off: str
+    effect: str
     """What happens when it is off."""
     stage: str = FRAME
     """Step in which it acts: one of `STAGES`, or `FRAME`."""
@@ -100,12 +100,12 @@ def _no_residual(_: Tensor, places: Tensor) -> Tensor:
     return torch.zeros(*places.shape[:-1], 3)
 
 
-def _none_afar(*args: Any, **_: Any) -> Tensor:
+def _none_undersampled(*args: Any, **_: Any) -> Tensor:
     return torch.zeros(len(args[2]), dtype=torch.bool)
 
 
-def _number(name: str, off: str, **numbers: Any) -> Rule:
-    return Rule(name, off, numbers={path.replace("__", "."): value for path, value in numbers.items()})
+def _number(name: str, effect: str, **numbers: Any) -> Rule:
+    return Rule(name, effect, numbers={path.replace("__", "."): value for path, value in numbers.items()})
 
 
 _SCENE = (
@@ -121,7 +121,7 @@ _SCENE = (
     Rule("develop", "no training step", "develop", (Switch(MAKER, "develop", _developed_as_is),)),
     Rule(
         "undersampled", "plate t* teaches what it sees from afar", "develop",
-        (Switch("instant.develop", "undersampled", _none_afar),),
+        (Switch("instant.develop", "undersampled", _none_undersampled),),
     ),
     Rule(
         "movers alone", "no second training of movers", "develop",
@@ -235,10 +235,12 @@ def variants(groups: tuple[str, ...]) -> dict[str, frozenset[str]]:
         if group == "combinations":
             found |= COMBINATIONS
         elif group in ("sweep-scene", f"sweep-{FRAME}"):
-            found |= {name: off for name, off in swept.items() if bool(of_frames(off)) == group.endswith(FRAME)}
+            found |= {
+                name: disabled for name, disabled in swept.items() if bool(of_frames(disabled)) == group.endswith(FRAME)
+            }
         elif group in ("scene", FRAME):
             of = {name for name, rule in RULES.items() if (rule.stage == FRAME) == (group == FRAME)}
-            found |= {name: off for name, off in every.items() if name.startswith("no ") and off <= of}
+            found |= {name: disabled for name, disabled in every.items() if name.startswith("no ") and disabled <= of}
         elif group in every:
             found[group] = every[group]
         else:
@@ -246,20 +248,20 @@ def variants(groups: tuple[str, ...]) -> dict[str, frozenset[str]]:
     return found
 
 
-def of_frames(off: frozenset[str]) -> frozenset[str]:
+def of_frames(disabled: frozenset[str]) -> frozenset[str]:
     """The rules that affect frames."""
-    return frozenset(name for name in off if RULES[name].stage == FRAME)
+    return frozenset(name for name in disabled if RULES[name].stage == FRAME)
 
 
-def of_stage(off: frozenset[str], stage: str) -> frozenset[str]:
+def of_stage(disabled: frozenset[str], stage: str) -> frozenset[str]:
     """The rules that act in a stage."""
-    return frozenset(name for name in off if RULES[name].stage == stage)
+    return frozenset(name for name in disabled if RULES[name].stage == stage)
 
 
-def detail_config(off: frozenset[str]) -> CompositeConfig:
-    """The compositing configuration with the numbers of rules `off` set to neutral values."""
+def detail_config(disabled: frozenset[str]) -> CompositeConfig:
+    """The compositing configuration with the numbers of rules `disabled` set to neutral values."""
     config = CompositeConfig()
-    for name in sorted(off):
+    for name in sorted(disabled):
         for path, value in RULES[name].numbers.items():
             config = _with(config, path.split("."), value)
     return config
@@ -272,9 +274,9 @@ def _with(config: Any, path: list[str], value: Any) -> Any:
 
 
 @contextlib.contextmanager
-def switched_off(off: frozenset[str]) -> Iterator[None]:
+def rules_disabled(disabled: frozenset[str]) -> Iterator[None]:
     """Context in which the names of rules are replaced. KeyError for an unknown rule."""
-    switches = [switch for name in sorted(off) for switch in RULES[name].switches]
+    switches = [switch for name in sorted(disabled) for switch in RULES[name].switches]
     with contextlib.ExitStack() as stack:
         for switch in switches:
             stack.enter_context(replaced(switch.module, switch.name, partial(_instead, switch)))

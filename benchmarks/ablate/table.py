@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import statistics
 from collections.abc import Iterable, Sequence
@@ -18,16 +19,16 @@ RECORD_VERSION = 1
 """Increase to invalidate older records."""
 TRUTH = {
     "delivered whole": "whole", "delivered never_seen": "never seen", "delivered moving": "moving",
-    "delivered static": "static", "recall": "recall", "over splats": "moving, delivered less developed",
+    "delivered static": "static", "recall": "recall", "over splats": "moving, delivered - developed",
 }  # fmt: skip
 """Figure of a record -> its column, against truth; in dB except recall."""
 CLIPS = {
-    "still": "still, dB", "excess": "flow left p99, moving less still, px", "moving_p50": "p50 moving, px",
-    "moving_p99": "p99 moving, px", "flicker": "flicker, /255", "decision_s": "decision, CPU s a frame",
+    "still": "still, dB", "excess": "p99 residual flow, moving - still, px", "moving_p50": "p50 moving, px",
+    "moving_p99": "p99 moving, px", "flicker": "flicker, /255", "decision_s": "decision, CPU s per frame",
     "instant_s": "instant, CPU s",
 }  # fmt: skip
 """Figure of a record -> its column, on clips."""
-MASKS = {"iou": "IoU of masks", "extra_share": "share of the unchanged that is let go"}
+MASKS = {"iou": "IoU of masks", "extra_share": "unchanged pixels rejected, share"}
 """Figure of a record -> its column, against hand-painted masks."""
 
 
@@ -60,10 +61,30 @@ class Store:
 
 
 def code_version(root: Path) -> str:
-    """Hash of the source text of the freeze and of this bench."""
+    """Hash of the code of the freeze and of this benchmark, without comments, docstrings and layout.
+
+    Edited documentation therefore keeps existing records valid.
+    """
     files = [*sorted((root / "torch_backend" / "freeze").rglob("*.py"))]
     files += [root / "benchmarks" / "ablate" / f"{name}.py" for name in ("switches", "measures", "instants")]
-    return content_key(RECORD_VERSION, [path.read_text(encoding="utf-8") for path in files])[:12]
+    return content_key(RECORD_VERSION, [_code_of(path) for path in files])[:12]
+
+
+def _code_of(path: Path) -> str:
+    """Dump of a file's syntax tree, which has no comments, after removal of docstrings.
+
+    Every expression statement that is a lone string is a docstring: of a module, class, function, field or constant.
+    """
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            node.body = [statement for statement in node.body if not _is_docstring(statement)]
+    return ast.dump(tree)
+
+
+def _is_docstring(statement: ast.stmt) -> bool:
+    value = statement.value if isinstance(statement, ast.Expr) else None
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)
 
 
 def figures(record: dict[str, Any]) -> dict[str, float | None]:
@@ -101,7 +122,7 @@ def table(records: Iterable[dict[str, Any]], columns: dict[str, str]) -> list[st
 
 SWEPT = {
     "delivered whole": "whole", "delivered moving": "moving", "delivered static": "static", "still": "still of clips",
-    "excess": "flow left",
+    "excess": "residual flow",
 }  # fmt: skip
 """Figure of a record -> its heading in the sweep table; in dB except flow, in pixels."""
 

@@ -4,11 +4,11 @@ The masks are polygons in `sitting.json`, `kitchen.json` and `hall.json` in this
 painted. `score` compares them with the pixels that a frozen frame rejects of its own plate.
 """
 
-from .masks import OTHER, SAME, UNSCORED, Painted, Pair, Polygon, load_masks, plate_labels
+from .masks import CHANGED, SAME, UNSCORED, Painted, Pair, Polygon, load_masks, plate_labels
 from .scores import Counts, Row, mean_counts, pooled_counts, score
 
 __all__ = [
-    "OTHER",
+    "CHANGED",
     "SAME",
     "UNSCORED",
     "Counts",

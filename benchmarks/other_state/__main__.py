@@ -28,7 +28,7 @@ from benchmarks.detail_clip import DetailClip, View, open_clip
 from benchmarks.sources import in_words
 from torch_backend.shot import write_json
 
-from .masks import CLIPS, OTHER, SAME, Labels, Painted, load_masks, sha256_of
+from .masks import CHANGED, CLIPS, SAME, Labels, Painted, load_masks, sha256_of
 from .scores import LET_GO, METHODS, Row, judged, mean_counts, pooled_counts
 
 FIGURES = ("iou", "precision", "recall", "extra_share")
@@ -81,10 +81,10 @@ def picture(clip: DetailClip, row: Row, view: View, labels: Labels) -> list[torc
     plate, label = clip.plate(row.frame), torch.from_numpy(labels)
     is_let_go = view.detailed.matte < LET_GO
     tints = [
-        ((label == OTHER) & is_let_go, (0.0, 1.0, 0.0)),
-        ((label == OTHER) & ~is_let_go, (1.0, 0.0, 0.0)),
+        ((label == CHANGED) & is_let_go, (0.0, 1.0, 0.0)),
+        ((label == CHANGED) & ~is_let_go, (1.0, 0.0, 0.0)),
         ((label == SAME) & is_let_go, (0.0, 0.2, 1.0)),
-        ((label != SAME) & (label != OTHER), (0.5, 0.5, 0.5)),
+        ((label != SAME) & (label != CHANGED), (0.5, 0.5, 0.5)),
     ]
     shown = plate.clone()
     for where, tint in tints:
@@ -110,9 +110,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shots", type=Path, nargs="+", metavar="SHOT")
     parser.add_argument("--run", default="main", metavar="NAME")
-    parser.add_argument("--clip", choices=CLIPS, help="whose masks; default: by the name of the shot's footage")
+    parser.add_argument(
+        "--clip", choices=CLIPS, help="clip whose masks are used (default: by the name of the shot's footage)"
+    )
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--pictures", action="store_true", help="a picture of each pair")
+    parser.add_argument("--pictures", action="store_true", help="write a picture of each pair")
     develop_argument(parser)
     args = parser.parse_args(argv)
     for shot in args.shots:

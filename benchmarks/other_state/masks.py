@@ -15,7 +15,7 @@ from torch_backend.contract import read_json
 
 CLIPS = ("sitting", "kitchen", "hall")
 """Clips of shared/footage that have masks."""
-SAME, OTHER, UNSCORED = 0, 1, 2
+SAME, CHANGED, UNSCORED = 0, 1, 2
 """Labels of a pixel: plate t* shows the same, another state, or it cannot be decided."""
 
 Labels = NDArray[np.uint8]
@@ -30,7 +30,7 @@ class Polygon:
     shows: str
     """Content of the frame in the polygon."""
     label: int
-    """OTHER, or UNSCORED where the polygon is uncertain."""
+    """CHANGED, or UNSCORED where the polygon is uncertain."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def load_masks(clip: str, folder: Path | None = None) -> Painted:
 
 def _pair(row: dict[str, Any]) -> Pair:
     polygons = (
-        Polygon(np.array(p["points"], np.float64), str(p["shows"]), UNSCORED if p.get("uncertain") else OTHER)
+        Polygon(np.array(p["points"], np.float64), str(p["shows"]), UNSCORED if p.get("uncertain") else CHANGED)
         for p in row["polygons"]
     )
     return Pair(int(row["t_star"]), int(row["frame"]), int(row["border_px"]), tuple(polygons))

@@ -15,7 +15,7 @@ from benchmarks.detail_clip import DetailClip, View, over
 from benchmarks.detail_figures import MOVER_MATTE
 from torch_backend.lens.plate_lens import load_plate_lenses
 
-from .masks import OTHER, SAME, Labels, Painted, plate_labels
+from .masks import CHANGED, SAME, Labels, Painted, plate_labels
 
 LET_GO = 0.5
 """A pixel's own plate is rejected if its matte is below this: more than half of the pixel comes from elsewhere."""
@@ -86,10 +86,10 @@ def _ratio(part: int, whole: int) -> float | None:
 
 def count(is_let_go: NDArray[np.bool_], labels: Labels) -> Counts:
     """Counts of one frame, from rejected pixels and labels, both [H, W]."""
-    is_other, is_same = labels == OTHER, labels == SAME
+    is_changed, is_same = labels == CHANGED, labels == SAME
     return Counts(
-        int((is_let_go & is_other).sum()), int((is_let_go & is_same).sum()),
-        int((~is_let_go & is_other).sum()), int((~is_let_go & is_same).sum()),
+        int((is_let_go & is_changed).sum()), int((is_let_go & is_same).sum()),
+        int((~is_let_go & is_changed).sum()), int((~is_let_go & is_same).sum()),
     )  # fmt: skip
 
 
@@ -140,5 +140,5 @@ def _let_go(clip: DetailClip, t_star: int, frame: int, view: View) -> tuple[Tens
     detailed = view.detailed
     # At the clip's own poses the own plate is the primary source. Otherwise no pixel of the own plate is kept.
     delivered = (detailed.matte < LET_GO) | (detailed.primary != frame)
-    own, frozen = clip.mattes(frame, t_star, view)
-    return delivered, torch.maximum(own, frozen) > MOVER_MATTE
+    matte, frozen = clip.mattes(frame, t_star, view)
+    return delivered, torch.maximum(matte, frozen) > MOVER_MATTE

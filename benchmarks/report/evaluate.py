@@ -60,8 +60,8 @@ class Frozen:
         if shown in (WITHHELD, DELIVERED) and self.compositor is not None:
             output = OutputFrame(pose, viewmat, K, float(self.t_star), float(pose))
             withheld = (pose,) if shown == WITHHELD else ()
-            made = self.compositor.frame(output, gaussians, image, self.run.width, self.run.height, withheld)
-            color, alpha = made.color, made.alpha
+            composite = self.compositor.frame(output, gaussians, image, self.run.width, self.run.height, withheld)
+            color, alpha = composite.color, composite.alpha
         return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0)
 
     def motion(self, pose: int) -> Tensor:
@@ -276,7 +276,7 @@ class _Keeper:
     ) -> None:
         self._truth, self._frozen, self._size, self._shown = truth, frozen, size, shown
         self._results = results
-        self._own = f"{PICTURES}/{run_id}" + (f"/{shown}" if shown != SPLATS else "")
+        self._run_pictures = f"{PICTURES}/{run_id}" + (f"/{shown}" if shown != SPLATS else "")
         self._common = f"{PICTURES}/{truth.key}-{size[0]}"
 
     def keep(self, of: Detailed) -> None:
@@ -299,11 +299,11 @@ class _Keeper:
             return []
         middle = float(np.median([row.pose for row in rows]))
 
-        def apart(pose: int) -> tuple[int, float]:
+        def spread_key(pose: int) -> tuple[int, float]:
             instants = [row.t_star for row in by_pose[pose]]
             return max(instants) - min(instants), -abs(pose - middle)
 
-        shared = sorted(by_pose[max(by_pose, key=apart)], key=lambda row: row.t_star)
+        shared = sorted(by_pose[max(by_pose, key=spread_key)], key=lambda row: row.t_star)
         return [self._picture(row) for row in ([shared[0], shared[-1]] if len(shared) > 1 else [])]
 
     def plates(self, pair: Sequence[Picture]) -> dict[str, str]:
@@ -312,7 +312,7 @@ class _Keeper:
 
     def _picture(self, row: FrameScore) -> Picture:
         name = f"{row.t_star:06d}_{row.pose:06d}.png"
-        ours, theirs = f"{self._own}/{name}", f"{self._common}/{name}"
+        ours, theirs = f"{self._run_pictures}/{name}", f"{self._common}/{name}"
         self._write(ours, self._frozen[row.t_star].view(row.pose, self._shown))
         if not (self._results / theirs).is_file():
             self._write(theirs, self._truth.truth(row.t_star, row.pose, *self._size))

@@ -8,7 +8,7 @@ import numpy as np
 
 from .records import SPLATS, FrameScore, RunRecord
 from .setting import NONE, Setting
-from .things import LEAST_PIXELS, RECALL_APART, RECALL_DISTANCE, overall
+from .things import LEAST_PIXELS, RECALL_CONTRAST, RECALL_DISTANCE, overall
 from .truth import PANES
 
 RECALLED = ("swinging", "arm")
@@ -33,30 +33,30 @@ PANE_HEADER = [
     "method",
     "glass, dB",
     "mirror, dB",
-    "wall beside, dB",
-    "glass less wall",
-    "mirror less wall",
+    "nearby wall, dB",
+    "glass - wall",
+    "mirror - wall",
     "glass opened",
     "mirror opened",
     "matte on glass",
     "matte on mirror",
 ]
 PANE_NOTE = (
-    "Mean PSNR in dB over pixels of a window's pane and of a mirror in which nothing moves, and of the still wall "
-    "within 0.6 m of them. Opened: share of the pane that the frozen frame's motion matte takes for something that "
-    "moves (above 0.5). Matte: share of the pane that the solve's motion matte calls moving, in brackets unknown."
+    "Mean PSNR in dB of window pane and mirror pixels in which nothing moves, and of the static wall within 0.6 m of "
+    "them. Opened: share of the pane where the frozen frame's motion matte exceeds 0.5, that is, falsely marks motion. "
+    "Matte: share of the pane that the solve's motion matte marks as moving; in brackets, as unknown."
 )
-THING_HEADER = ["method", "recall of the apple", "worst pose", "recall of the arm", "worst pose", "arm, dB", "hair, dB"]
-THING_NOTE = (
+MOVER_HEADER = ["method", "recall of the apple", "worst pose", "recall of the arm", "worst pose", "arm, dB", "hair, dB"]
+MOVER_NOTE = (
     "Recall: of the pixels that show an apple of 2 % of the picture's width that swings on a thread, and a gesturing "
     f"arm, at t* in the truth, the share that shows it in the frozen frame: colour within {RECALL_DISTANCE} (root mean "
     "square over the channels) of the truth, and nearer to it than to what stands behind. Pixels whose background is "
-    f"within {RECALL_APART} of the thing do not count; the worst pose is one with at least {LEAST_PIXELS} that do. "
+    f"within {RECALL_CONTRAST} of the thing do not count; the worst pose is one with at least {LEAST_PIXELS} that do. "
     "Hair: loose strands before a bright window, mean PSNR in dB over pixels of which they cover at least 15 %."
 )
 
 
-def thing_rows(settings: Sequence[Setting]) -> list[list[str]]:
+def mover_rows(settings: Sequence[Setting]) -> list[list[str]]:
     """Row per setting with a small mover or hair: recall over all poses and in the worst one, and dB."""
     rows: list[list[str]] = []
     for s in settings:

@@ -114,7 +114,7 @@ def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
     gap = 0.045 * (axes.get_ylim()[1] - axes.get_ylim()[0])
     placed: list[tuple[float, float]] = []
     for x, y, name, colour in sorted(named, key=lambda p: p[1]):
-        near = [at for other, at in placed if abs(np.log(other / x)) < 1.2]
+        near = [at for label_y, at in placed if abs(np.log(label_y / x)) < 1.2]
         at = max([y, *(v + gap for v in near if v + gap > y)], default=y)
         placed.append((x, at))
         line = {"arrowstyle": "-", "color": colour, "lw": 0.5} if at - y > gap / 2 else None

@@ -52,25 +52,25 @@ class Setting:
         values = [v for run in self.runs for v in run.heldout_values(region).values() if v is not None]
         return float(np.mean(values)) if values else None
 
-    def against(self, other: Setting, metric: str, region: str = WHOLE) -> Paired | None:
+    def against(self, reference: Setting, metric: str, region: str = WHOLE) -> Paired | None:
         """Comparison with another setting, frame by frame, or for `jod` instant by instant."""
         if metric == "jod":
-            return self._against(other, RunRecord.jod_values)
-        return self._against(other, lambda run: run.values(metric, region), METRICS[metric])
+            return self._against(reference, RunRecord.jod_values)
+        return self._against(reference, lambda run: run.values(metric, region), METRICS[metric])
 
-    def against_heldout(self, other: Setting, region: str) -> Paired | None:
+    def against_heldout(self, reference: Setting, region: str) -> Paired | None:
         """Comparison of PSNR on the clip's held-out frames with another setting, frame by frame."""
-        return self._against(other, lambda run: run.heldout_values(region))
+        return self._against(reference, lambda run: run.heldout_values(region))
 
     def _against(
-        self, other: Setting, read: Callable[[RunRecord], dict[Key, float | None]], more_is_better: bool = True
+        self, reference: Setting, read: Callable[[RunRecord], dict[Key, float | None]], more_is_better: bool = True
     ) -> Paired | None:
-        mine, theirs = ({k: v for run in s.runs for k, v in read(run).items()} for s in (self, other))
+        mine, theirs = ({k: v for run in s.runs for k, v in read(run).items()} for s in (self, reference))
         return paired(mine, theirs, more_is_better)
 
-    def ratio(self, other: Setting, read: Callable[[RunRecord], float | None]) -> float | None:
+    def ratio(self, reference: Setting, read: Callable[[RunRecord], float | None]) -> float | None:
         """Geometric mean, over scenes and seeds, of a cost relative to another setting's; None without common runs."""
-        of_place = {run.place: read(run) for run in other.runs}
+        of_place = {run.place: read(run) for run in reference.runs}
         pairs = [(read(run), of_place.get(run.place)) for run in self.runs]
         logs = [float(np.log(a / b)) for a, b in pairs if a and b]
         return float(np.exp(np.mean(logs))) if logs else None

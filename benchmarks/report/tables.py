@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .hard_table import PANE_HEADER, PANE_NOTE, THING_HEADER, THING_NOTE, pane_rows, thing_rows
+from .hard_table import MOVER_HEADER, MOVER_NOTE, PANE_HEADER, PANE_NOTE, mover_rows, pane_rows
 from .metrics import WHOLE, Paired
 from .records import DELIVERED, DEVELOPED, SPLATS, WITHHELD, RunRecord
 from .setting import NONE, Setting
@@ -27,22 +27,22 @@ REGION_NAMES = {
     "never_seen": "never seen at t*",
     "moving": "moving",
     "static": "static",
-    RIGID: "what never moves",
+    RIGID: "never moves",
 }
 SHOWN_NAMES = {DEVELOPED: "developed", WITHHELD: "plate detail, plate withheld", DELIVERED: "plate detail"}
 """Variant of a frame, except Gaussians alone -> suffix of the method's name."""
 QUERIES = {"plain": "at t*", "nearest": "nearest seen"}
 """Time query of the Gaussians -> text in a table."""
 QUERY_NOTE = (
-    "Hosts without anchors and with the paper's are frozen at t* itself, as published; with support every Gaussian is "
-    "asked at the time nearest to t* at which it was seen."
+    "Hosts without anchors, or with the paper's anchors, are frozen at t* itself, as published. With `support`, each "
+    "Gaussian is evaluated at the time nearest to t* at which it was seen."
 )
 DETAIL_NOTE = (
-    "A method alone is splats alone, as the training left them; *developed*: the instant's splats, trained on as the "
-    "still scene that it is. With *plate detail* the frames are what a take delivers: of the developed instant, and of "
-    "the plates' own pixels, carried to t*, where they can be believed. *Plate withheld*: without the plate of the "
-    "pose that is judged, which on what never moves is the answer itself. What is delivered at t*'s own pose is the "
-    "truth itself, and not counted."
+    "A method's name without suffix: only Gaussians, as trained. *Developed*: the Gaussians are fine-tuned at t* as a "
+    "static scene. *Plate detail*: frames as a take delivers them, with pixels of the plates warped to t* where they "
+    "are consistent with the developed instant. *Plate withheld*: the same, without the plate of the judged pose, "
+    "which equals the truth wherever nothing moves. The delivered frame at the pose of t* equals the truth and is not "
+    "counted."
 )
 _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
 
@@ -64,8 +64,8 @@ def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
 
     Each variant in `detailed` is a separate setting, after the one of Gaussians alone.
     """
-    alone = [r for r in records if r.kind == kind]
-    chosen = [shown for r in alone for shown in (r, *(r.as_shown(name) for name in r.detailed))]
+    of_kind = [r for r in records if r.kind == kind]
+    chosen = [shown for r in of_kind for shown in (r, *(r.as_shown(name) for name in r.detailed))]
     presets, cameras = {r.preset for r in chosen}, {r.cameras for r in chosen}
     groups: dict[tuple[str, ...], list[RunRecord]] = {}
     for record in chosen:
@@ -75,8 +75,8 @@ def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
     def order(setting: tuple[str, ...]) -> tuple[Any, ...]:
         host, supervision, preset, variant, camera, shown = setting
         at = hosts.index(host) if host in hosts else len(hosts)
-        made = (SPLATS, *SHOWN_NAMES).index(shown)
-        return camera, preset, variant != "default", at, supervisions.index(supervision), variant, made
+        shown_rank = (SPLATS, *SHOWN_NAMES).index(shown)
+        return camera, preset, variant != "default", at, supervisions.index(supervision), variant, shown_rank
 
     found: list[Setting] = []
     for key in sorted(groups, key=order):
@@ -110,20 +110,20 @@ def all_tables(records: Sequence[RunRecord]) -> list[Table]:
             _who_wins(main),
             _quality(main, WHOLE, "Frozen frames against the rendered truth, whole frame"),
             _regions(main),
-            _every_metric(main, (WHOLE, "never_seen"), "Every metric, frame by frame"),
+            _every_metric(main, (WHOLE, "never_seen"), "All metrics, frame by frame"),
         ]
     if rows := pane_rows(main):
         tables.append(Table("Glass and mirrors", PANE_HEADER, rows, PANE_NOTE))
-    if rows := thing_rows(main):
-        tables.append(Table("Small movers, and hair", THING_HEADER, rows, THING_NOTE))
+    if rows := mover_rows(main):
+        tables.append(Table("Small moving objects and hair", MOVER_HEADER, rows, MOVER_NOTE))
     ablations = [s for s in synthetic if s.variant not in ("default", "reference") and s.shown == SPLATS]
     if ablations:
         tables.append(_ablations(ablations, main))
     if real:
         tables += [
-            _quality(real, RIGID, "Real clips, where nothing moves: frozen frames against held-out plates"),
+            _quality(real, RIGID, "Real clips: static pixels of frozen frames against held-out plates"),
             _real_extra(real),
-            _every_metric(real, (RIGID,), "Real clips: every metric, frame by frame"),
+            _every_metric(real, (RIGID,), "Real clips: all metrics, frame by frame"),
         ]
     tables += [_costs(s) for s in (main, real) if s]
     return tables
@@ -136,7 +136,7 @@ def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
     for s in settings:
         psnr = s.summary("psnr_db", region)
         shares = [psnr.mean, psnr.bottom_75, psnr.bottom_50, psnr.bottom_25, psnr.worst] if psnr else [None] * 5
-        others = [(m, s.summary(m, region)) for m in ("ssim", "st_lpips", "flip")]
+        more_metrics = [(m, s.summary(m, region)) for m in ("ssim", "st_lpips", "flip")]
         means.append(shares[0])
         rows.append(
             [
@@ -145,14 +145,14 @@ def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
                 str(len(s.runs)),
                 str(psnr.count if psnr else 0),
                 *(number(v, "psnr_db") for v in shares),
-                *(number(summary and summary.mean, m) for m, summary in others),
+                *(number(summary and summary.mean, m) for m, summary in more_metrics),
                 number(s.jod(), "jod"),
             ]
         )
     note = (
-        "PSNR in dB; bottom shares are means of the worst frames, as in the paper's tables. SSIM and JOD "
-        f"(ColorVideoVDP, 10 is no difference): more is better; ST-LPIPS and FLIP: less is better. {QUERY_NOTE}"
-        + _detail_note(settings)
+        "PSNR in dB. Bottom shares are means over the worst frames, as in the paper's tables. SSIM and JOD "
+        "(ColorVideoVDP; 10 means no difference): higher is better. ST-LPIPS and FLIP: lower is better. "
+        f"{QUERY_NOTE}" + _detail_note(settings)
     )
     return Table(title, header, rows, note, _best(means))
 
@@ -163,7 +163,9 @@ def _regions(settings: Sequence[Setting]) -> Table:
         found = [s.summary("psnr_db", region) for region in (WHOLE, *REGIONS)]
         rows.append([s.label, *(number(f and f.mean, "psnr_db") for f in found)])
     header = ["method", *(REGION_NAMES[region] for region in (WHOLE, *REGIONS))]
-    note = "Mean PSNR in dB over frames in which the region is at least 0.2 % of the picture." + _detail_note(settings)
+    note = "Mean PSNR in dB over the frames in which the region covers at least 0.2 % of the picture." + _detail_note(
+        settings
+    )
     return Table("By region", header, rows, note)
 
 
@@ -203,15 +205,17 @@ def _costs(settings: Sequence[Setting]) -> Table:
     loads = [r.machine.get("load_1min") for s in settings for r in s.runs]
     known = [load for load in loads if load is not None]
     note = (
-        "Means over runs. Held-out: frames of the clip kept out of training, each at its own time: whole, on what "
-        "moves, on what does not. Seconds, milliseconds and frames per second are wall time with that many threads per "
-        "run and that many runs at once; a step's are those of the last third of the run, with the measurements in it. "
-        "Developed and with plate detail a run is the same one, frozen otherwise."
+        "Means over runs. Held-out PSNR: frames of the clip that training left out, rendered at their own times; whole "
+        "frame, moving and static pixels. Times are wall time with that number of threads per run and of concurrent "
+        "runs. Milliseconds per step are measured in the last third of the run, including evaluations. Rows with "
+        "developed instants or plate detail use the same trained run."
     )
     if known:
-        note += f" Load of the machine after the runs: {min(known):.1f} to {max(known):.1f}; wall times include it."
+        note += (
+            f" Load average of the machine after the runs: {min(known):.1f} to {max(known):.1f}; it affects wall times."
+        )
     kind = "real clips" if settings[0].runs[0].kind == "real" else "synthetic scenes"
-    return Table(f"What it cost ({kind})", header, rows, note)
+    return Table(f"Cost ({kind})", header, rows, note)
 
 
 def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
@@ -230,8 +234,8 @@ def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
             published = [s for s in at.values() if s.variant == "reference" and s not in bare]
             gateless = [s for s in at.values() if (s.variant, s.host, s.supervision) == (*GATELESS, "support")]
             pairs += [(ours, s) for s in (*bare, *published, *gateless)]
-        made = [s for s in group if s.shown != SPLATS]
-        pairs += [(s, at[s.variant, s.host, s.supervision]) for s in made]
+        derived = [s for s in group if s.shown != SPLATS]
+        pairs += [(s, at[s.variant, s.host, s.supervision]) for s in derived]
     return pairs
 
 
@@ -249,7 +253,7 @@ def _places(settings: Sequence[Setting]) -> list[list[Setting]]:
 
 def _who_wins(settings: Sequence[Setting]) -> Table:
     """Table of all comparisons: mean paired difference, its standard error, and relative cost."""
-    header = ["a against b", "where", "cost a / b", "PSNR a - b, dB", "standard error", "n", "frames", "verdict"]
+    header = ["a against b", "region", "cost a / b", "PSNR a - b, dB", "standard error", "n", "frames", "verdict"]
     rows: list[list[str]] = []
 
     def add(a: Setting, b: Setting, where: str, result: Paired | None, cost: str = "") -> None:
@@ -276,13 +280,13 @@ def _who_wins(settings: Sequence[Setting]) -> Table:
         elif b.variant == "reference":
             add(a, b, REGION_NAMES[WHOLE], a.against(b, "psnr_db"), seconds)
     note = (
-        "A win or a loss: the mean difference over frames exceeds twice its standard error. Frames of one run fail "
-        "together, so the error is taken over runs, that is pairs of (scene, training seed), where there are at least "
-        "four, else over freezes (and t*), else over frames, which is too small an error. Fewer than four units decide "
-        "nothing. Costs are geometric means over runs of the same scene and seed; a step's are those of the last third "
-        f"of a run. {QUERY_NOTE}"
+        "Win or loss: the mean difference exceeds twice its standard error. Frames of one run are correlated. The "
+        "standard error is therefore taken over runs, that is (scene, training seed) pairs, if there are at least "
+        "four; else over freezes, that is (run, t*) pairs; else over frames, which underestimates it. With fewer than "
+        "four units the verdict is undecided. Costs are geometric means of ratios over runs of the same scene and "
+        f"seed. Costs of a step are measured in the last third of a run. {QUERY_NOTE}"
     )
-    return Table("Who wins", header, rows, note)
+    return Table("Paired comparisons", header, rows, note)
 
 
 def _frame_seconds(run: RunRecord) -> float | None:
@@ -306,8 +310,8 @@ def _every_metric(settings: Sequence[Setting], regions: Sequence[str], title: st
                 label = f"{a.label} against {b.label}"
                 rows.append([label, REGION_NAMES[region], *cells, f"{psnr.units} {psnr.unit}"])
     note = (
-        "a - b, mean and standard error, with the verdict where there is one (for ST-LPIPS and FLIP less is better); "
-        "ColorVideoVDP (JOD) is of whole frames, each instant one sequence."
+        "a - b: mean, standard error, and the verdict unless it is undecided. For ST-LPIPS and FLIP lower is better. "
+        "JOD (ColorVideoVDP) is measured on whole frames; each instant is one sequence."
     )
     return Table(title, header, rows, note)
 
@@ -329,8 +333,8 @@ def _ablations(ablations: Sequence[Setting], main: Sequence[Setting]) -> Table:
     header = ["ablation", "of", "region", "PSNR a - b, dB", "standard error", "independent units", "frames", "verdict"]
     rows: list[list[str]] = []
     for s in ablations:
-        alone = [m for m in main if m.shown == SPLATS]
-        same = [m for m in alone if (m.cameras, m.preset, m.host) == (s.cameras, s.preset, s.host)]
+        splats = [m for m in main if m.shown == SPLATS]
+        same = [m for m in splats if (m.cameras, m.preset, m.host) == (s.cameras, s.preset, s.host)]
         base = next((m for m in same if m.supervision == s.supervision), same[-1] if same else None)
         if base is None:
             continue
@@ -338,7 +342,7 @@ def _ablations(ablations: Sequence[Setting], main: Sequence[Setting]) -> Table:
             result = s.against(base, "psnr_db", region)
             if result is not None:
                 rows.append([s.variant, base.label, REGION_NAMES[region], *_paired_cells(result)])
-    note = "Below zero: what was taken away helped."
+    note = "A difference below zero means that the removed part had improved the result."
     return Table("Ablations", header, rows, note)
 
 
@@ -349,10 +353,15 @@ def _real_extra(settings: Sequence[Setting]) -> Table:
         energy = s.of_frames(lambda row: row.gradient_ratio)
         cells = [number(whole and whole.mean, "psnr_db"), number(best and best.mean, "psnr_db")]
         rows.append([s.label, *cells, plain(energy and energy.mean, 3)])
-    header = ["method", "PSNR whole frame, dB", "PSNR best 90 % of the pixels, dB", "gradient energy of the plate's"]
+    header = [
+        "method",
+        "PSNR whole frame, dB",
+        "PSNR best 90 % of the pixels, dB",
+        "gradient energy relative to the plate",
+    ]
     note = (
-        "The whole frame holds people who moved since, whom no freeze at another instant can match. Gradient energy: "
-        "mean squared luma differences over what never moves, of the plate's; below 1 is softer."
+        "Whole frames show people who have moved since t*, which no frozen frame can match. Gradient energy: mean "
+        "squared luma gradients of pixels that never move, divided by those of the plate; below 1 is softer."
     )
     return Table("Real clips: whole frame and sharpness", header, rows, note)
 

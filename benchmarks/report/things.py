@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 RECALL_DISTANCE = 0.15
 """Greatest distance of a pixel's colour from the truth with which it shows the thing: root mean square over channels of
 display-referred values in [0, 1]. It equals a PSNR of 16.5 dB: the thing may be soft or slightly displaced."""
-RECALL_APART = 0.1
+RECALL_CONTRAST = 0.1
 """Distance of thing and background, in the same measure, below which they are too similar; such pixels do not
 count."""
 LEAST_PIXELS = 6
@@ -37,8 +37,8 @@ def recalled(image: Tensor, truth: Tensor, behind: Tensor, mask: Tensor) -> tupl
         image, truth, behind: [H, W, 3] display-referred in [0, 1]; `behind` is the truth without the thing.
         mask: bool [H, W], the thing's pixels in the truth.
     """
-    error, mistaken, apart = (_distance(a, b) for a, b in ((image, truth), (image, behind), (truth, behind)))
-    counted = mask & (apart > RECALL_APART)
+    error, mistaken, contrast = (_distance(a, b) for a, b in ((image, truth), (image, behind), (truth, behind)))
+    counted = mask & (contrast > RECALL_CONTRAST)
     return int((counted & (error <= RECALL_DISTANCE) & (error < mistaken)).sum()), int(counted.sum())
 
 

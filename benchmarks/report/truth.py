@@ -32,9 +32,9 @@ PANES = ("glass", "mirror")
 HELD = "held"
 """Optional region: pixels where the plate of the pose shows another state than t*, although they are still within half
 a second of that plate."""
-HELD_THINGS = ("raised", "turned", "resting", "leaving", "set_down")
+HELD_ROLES = ("raised", "turned", "resting", "leaving", "set_down")
 """An arm raised once; a head that turns unseen; a hand that leaves a table; a person who leaves; a box put down."""
-THINGS = (*PANES, "wall", "swinging", "arm", "hair", *HELD_THINGS, HELD)
+OBJECT_REGIONS = (*PANES, "wall", "swinging", "arm", "hair", *HELD_ROLES, HELD)
 """Names of all things of hard scenes, including the still wall near panes, a swinging object, a gesturing arm, hair."""
 RIGID = "rigid"
 """The region of a real clip in which the plate is the truth."""
@@ -68,7 +68,7 @@ class TruthScene(Protocol):
         ...
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """{name: bool [height, width]}; in hard scenes also some of `THINGS`."""
+        """{name: bool [height, width]}; in hard scenes also some of `OBJECT_REGIONS`."""
         ...
 
     def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
@@ -76,7 +76,7 @@ class TruthScene(Protocol):
         ...
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """`moving`, `static` and the available `THINGS`, bool [height, width], of the clip's own frame.
+        """`moving`, `static` and the available `OBJECT_REGIONS`, bool [height, width], of the clip's own frame.
 
         {} if unknown.
         """

@@ -30,8 +30,8 @@ def arguments(argv: list[str] | None) -> argparse.Namespace:
         f"reporting; tune on {TUNING_SEEDS.start} to {TUNING_SEEDS.stop - 1})",
     )
     parser.add_argument("--kinds", choices=KINDS, nargs="+", default=["plain"])
-    parser.add_argument("--limits", action="store_true", help="the four limit scenes as well, of the first seed")
-    parser.add_argument("--hard", action="store_true", help="the four hard scenes as well, of every seed")
+    parser.add_argument("--limits", action="store_true", help="also make the four limit scenes of the first seed")
+    parser.add_argument("--hard", action="store_true", help="also make the four hard scenes of every seed")
     parser.add_argument("--out", type=Path, default=default_folder(), help="default: %(default)s")
     parser.add_argument("--bpy", help="Python with bpy, or its environment (default: .venv-bpy-5.0)")
     return parser.parse_args(argv)

@@ -43,9 +43,9 @@ class CameraMove:
             yaw = side * np.radians(-24.0 + 48.0 * u)
             target = eye + 3.5 * np.stack([np.sin(yaw), np.cos(yaw)], 1)
         elif self.move == "return":
-            away = np.sin(np.pi * np.clip(u, -0.5, 1.5))
-            eye = np.stack([side * (-1.3 + 2.6 * away), -3.4 + depth + 0.7 * away], 1)
-            target = np.stack([side * (-0.4 + 0.7 * away), np.full_like(u, 0.6)], 1)
+            sway = np.sin(np.pi * np.clip(u, -0.5, 1.5))
+            eye = np.stack([side * (-1.3 + 2.6 * sway), -3.4 + depth + 0.7 * sway], 1)
+            target = np.stack([side * (-0.4 + 0.7 * sway), np.full_like(u, 0.6)], 1)
         elif self.move == "orbit":
             angle = side * np.radians(-36.0 + 72.0 * u)
             radius = 3.6 + depth
@@ -53,9 +53,9 @@ class CameraMove:
             target = np.tile([0.0, 0.4], (len(u), 1))
         elif self.move == "tripod":
             yaw = side * np.radians(-16.0 + 32.0 * u)
-            ahead = np.stack([np.sin(yaw), np.cos(yaw)], 1)
-            eye = np.array([0.0, -3.4 + depth]) + PIVOT_METRES * ahead
-            target = eye + 3.5 * ahead
+            forward = np.stack([np.sin(yaw), np.cos(yaw)], 1)
+            eye = np.array([0.0, -3.4 + depth]) + PIVOT_METRES * forward
+            target = eye + 3.5 * forward
         else:
             raise ValueError(f"camera move {self.move!r} is none of forward, pan, return, orbit, tripod")
         walking = 0.015 * np.sin(2 * np.pi * 1.8 * seconds) if self.move not in ("pan", "tripod") else 0.0

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from torch_backend.footage.images import read_png
 
-from .sizes import FORMAT_VERSION, THING
+from .sizes import FORMAT_VERSION, OBJECT_PREFIX
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Regions:
     """[H, W] the surface point moves in this view by more than `moving_px` at some frame of the clip."""
     seen: NDArray[np.bool_]
     """[H, W] the surface point is visible in the clip's own frame t*."""
-    things: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    objects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     """{name: [H, W]} things of a hard scene: glass, mirror and the nearby wall, swinging, arm, hair, the held things,
     and the region held."""
 
@@ -44,9 +44,9 @@ class Regions:
     def of(cls, data: Mapping[str, NDArray]) -> Regions:
         """Regions from the arrays of an .npz file. Clip frames have no `seen`; all their pixels count as seen."""
         moving = data["moving"]
-        things = {name.removeprefix(THING): data[name] for name in data if name.startswith(THING)}
+        objects = {name.removeprefix(OBJECT_PREFIX): data[name] for name in data if name.startswith(OBJECT_PREFIX)}
         seen = data["seen"] if "seen" in data else np.ones_like(moving)
-        return cls(_metres(data["depth_mm"]), moving, seen, things)
+        return cls(_metres(data["depth_mm"]), moving, seen, objects)
 
 
 @dataclass(frozen=True)

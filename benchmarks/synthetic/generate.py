@@ -20,7 +20,7 @@ from torch_backend.shot import atomic_path, write_json
 
 from .cameras import FOCAL_PER_WIDTH, CameraMove, intrinsics
 from .geometry import Builder, Mesh, turn
-from .hard import Staging, Thing, apple, arm_of, hair_of, share_in_view, stage
+from .hard import SceneObject, Staging, apple, arm_of, hair_of, share_in_view, stage
 from .held import Held, cast, perform
 from .noise import Array, stream
 from .panes import GLASS, GLASS_INDEX, MIRROR, MIRROR_SHARE
@@ -92,10 +92,10 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
     people = [part.person for part in scene.parts] if scene else _people(seed, kind, path, camera, staging)
     kept = [Keepout(*p.place, 0.45) for p in people] + staging.clear + (scene.clear if scene else [])
     kept += [Keepout(x, p.place[1], 0.45) for p in people if p.walks for x in np.linspace(*_ends(p), 8)]
-    furnisher = Furnisher(seed, path, kept, staging.ahead)
+    furnisher = Furnisher(seed, path, kept, staging.front_wall)
     movers: list[Mover] = []
-    made: tuple[Array, Mesh, Thing] | None = None
-    thing: Thing | None = None
+    key_object: tuple[Array, Mesh, SceneObject] | None = None
+    scene_object: SceneObject | None = None
     for person in people:
         body = bodies.make(person, seed, seconds)
         if kind == "still":
@@ -108,17 +108,17 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
         if body.seat:
             furnisher.stool(*body.seat, person.heading)
         if person.gesture:
-            thing = arm_of(bodies, person.name)
+            scene_object = arm_of(bodies, person.name)
         if kind == "hair" and person is people[0]:
-            made = hair_of(folder, bodies, body, seed, seconds)
+            key_object = hair_of(folder, bodies, body, seed, seconds)
         if scene:
             for extra in perform(folder, scene.part_of(person), bodies, body, furnisher, seed, seconds):
                 movers.append(Mover(extra[0], extra[1].astype(np.float32), extra[2], f"{extra[0]}.png"))
     if staging.apple:
-        made = apple(folder, seed, seconds, staging.apple, path)
-    if made:
-        vertices, mesh, thing = made
-        movers.append(Mover(thing.mover, vertices.astype(np.float32), mesh, f"{thing.mover}.png"))
+        key_object = apple(folder, seed, seconds, staging.apple, path)
+    if key_object:
+        vertices, mesh, scene_object = key_object
+        movers.append(Mover(scene_object.mover, vertices.astype(np.float32), mesh, f"{scene_object.mover}.png"))
     if scene:
         scene.furnish(furnisher)
     place, static = furnisher.room() if place_of(seed, kind) == "room" else furnisher.ground()
@@ -132,10 +132,10 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
         _write_mesh(folder / "geometry" / f"{mover.name}.npz", mover.mesh)
         with atomic_path(folder / "geometry" / f"{mover.name}.npy") as partial:
             np.save(partial, mover.vertices, allow_pickle=False)
-    if thing:
+    if scene_object:
         with atomic_path(folder / "geometry" / "thing.npz") as partial:
-            np.savez(partial, faces=thing.faces, gone=thing.gone)
-    plan = _plan(key, seed, kind, size, camera, people, movers, thing, place)
+            np.savez(partial, faces=scene_object.faces, gone=scene_object.gone)
+    plan = _plan(key, seed, kind, size, camera, people, movers, scene_object, place)
     if scene:
         _write_held(folder, plan, size, camera, scene, movers)
     write_json(folder / "plan.json", plan)
@@ -145,24 +145,32 @@ def _write_held(
     folder: Path, plan: dict[str, Any], size: Size, camera: CameraMove, scene: Held, movers: list[Mover]
 ) -> None:
     """Writes geometry/held.npz; adds held things, pictures of their other state, and motion blur to the plan."""
-    things = [thing for part in scene.parts for thing in part.things]
+    scene_objects = [scene_object for part in scene.parts for scene_object in part.objects]
     with atomic_path(folder / "geometry" / "held.npz") as partial:
-        np.savez(partial, allow_pickle=False, **{thing.name: thing.faces for thing in things})
+        np.savez(
+            partial, allow_pickle=False, **{scene_object.name: scene_object.faces for scene_object in scene_objects}
+        )
     plan["held"] = [
-        {"thing": thing.name, "mover": thing.mover} | part.to_json() for part in scene.parts for thing in part.things
+        {"thing": scene_object.name, "mover": scene_object.mover} | part.to_json()
+        for part in scene.parts
+        for scene_object in part.objects
     ]
     plan["samples"] = max(1, round(size.samples / SUBFRAMES))
     plan["oversize"] = min(size.oversize, SUBFRAME_OVERSIZE)
     for job in plan["jobs"]:
         job["shutter"] = _shutter(job, size, camera)
     by_name = {mover.name: mover for mover in movers}
-    plan["jobs"] = _with_behind(plan["jobs"], size, [(by_name[thing.mover], thing.faces) for thing in things])
+    plan["jobs"] = _with_behind(
+        plan["jobs"], size, [(by_name[scene_object.mover], scene_object.faces) for scene_object in scene_objects]
+    )
     for job in plan["jobs"]:
         if "box" in job:
             # These pictures are only compared by colour, so one moment is enough.
             job["shutter"] = job["shutter"][SUBFRAMES // 2 : SUBFRAMES // 2 + 1]
             job["elsewhen"] = {
-                name: float(np.clip(part.other_time(job["bands"][0]["time"] / size.fps) * size.fps, 0, size.frames - 1))
+                name: float(
+                    np.clip(part.time_in_other_state(job["bands"][0]["time"] / size.fps) * size.fps, 0, size.frames - 1)
+                )
                 for part in scene.parts
                 for name in part.movers
             }
@@ -187,7 +195,7 @@ def _plan(
     camera: CameraMove,
     people: list[Person],
     movers: list[Mover],
-    thing: Thing | None,
+    scene_object: SceneObject | None,
     place: Place,
 ) -> dict[str, Any]:
     """The content of plan.json, read by render_bpy.py."""
@@ -213,11 +221,11 @@ def _plan(
     if place.panes:
         plan["panes"] = [pane.to_json() for pane in place.panes]
         plan["reflects"] = {GLASS: GLASS_INDEX, MIRROR: MIRROR_SHARE}
-    if thing:
-        plan["thing"] = {"name": thing.name, "mover": thing.mover}
-        if thing.gone.any():
-            mover = next(m for m in movers if m.name == thing.mover)
-            plan["jobs"] = _with_behind(plan["jobs"], size, [(mover, thing.faces)])
+    if scene_object:
+        plan["thing"] = {"name": scene_object.name, "mover": scene_object.mover}
+        if scene_object.gone.any():
+            mover = next(m for m in movers if m.name == scene_object.mover)
+            plan["jobs"] = _with_behind(plan["jobs"], size, [(mover, scene_object.faces)])
     return plan
 
 
@@ -259,8 +267,8 @@ def _people(seed: int, kind: str, path: Array, camera: CameraMove, staging: Stag
         x, y = staging.first if staging.first and of_the_scene else (x, y)
         clear = np.hypot(path[:, 0] - x, path[:, 1] - y).min() > 0.85
         clear &= of_the_scene or all(np.hypot(k.x - x, k.y - y) > k.radius + 0.35 for k in staging.clear)
-        apart = all(np.hypot(p.place[0] - x, p.place[1] - y) > 0.95 for p in people)
-        placed = clear and apart and share_in_view(views, np.array([x, y, 1.0])) >= 0.5
+        is_clear = all(np.hypot(p.place[0] - x, p.place[1] - y) > 0.95 for p in people)
+        placed = clear and is_clear and share_in_view(views, np.array([x, y, 1.0])) >= 0.5
         if not walks and not of_the_scene and not placed:
             continue
         to_camera = path[len(path) // 2] - [x, y]
@@ -362,7 +370,7 @@ def _jobs(seed: int, kind: str, size: Size, camera: CameraMove) -> list[dict[str
 
 
 def _with_behind(
-    jobs: list[dict[str, Any]], size: Size, things: Sequence[tuple[Mover, NDArray[np.bool_]]]
+    jobs: list[dict[str, Any]], size: Size, scene_objects: Sequence[tuple[Mover, NDArray[np.bool_]]]
 ) -> list[dict[str, Any]]:
     """Inserts, after each truth that shows a thing, a picture of the background behind the things, cropped to them."""
     K, found = intrinsics(size.width, size.height), []
@@ -374,7 +382,7 @@ def _with_behind(
         view = np.array(band["world_to_camera"])
         boxes = [
             _box_of(mover.vertices[round(band["time"])][np.unique(mover.mesh.triangles[faces])], view, K, size)
-            for mover, faces in things
+            for mover, faces in scene_objects
         ]
         boxes = [box for box in boxes if box is not None]
         if boxes:

@@ -20,7 +20,7 @@ from torch_backend.footage.images import write_png
 from .cameras import FOCAL_PER_WIDTH
 from .geometry import Builder, Mesh
 from .noise import Array, fractal, stream, wander
-from .places import Keepout, WallAhead
+from .places import FrontWall, Keepout
 from .textures import hsv
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ _HEAD_HEIGHT, _BACK_WALL = 1.6, 3.8
 class Staging:
     """Requirements of a hard scene on its place, fixed before furniture and other people are placed."""
 
-    ahead: WallAhead | None = None
+    front_wall: FrontWall | None = None
     first: tuple[float, float] | None = None
     """Position of the first person, whose arm or hair is the scene's thing."""
     apple: tuple[float, float] | None = None
@@ -59,7 +59,7 @@ class Staging:
 
 
 @dataclass
-class Thing:
+class SceneObject:
     """The thing of a hard scene, as triangles of one mover."""
 
     name: str
@@ -81,9 +81,9 @@ def stage(kind: str, seed: int, path: Array, views: Array) -> Staging:
     """Places the things of a hard scene. `path` [P, 2]: x, y of the camera; `views` [C, 4, 4]: world-to-camera."""
     side = float(stream(seed, "staging").choice([-1.0, 1.0]))
     if kind == "glass":
-        ahead = WallAhead(0.95 * side, mirror_x=-1.15 * side, glazed=True, garden=True, sky_strength=EVENING_SKY)
-        targets = [(ahead.window_x, _BACK_WALL), (-1.15 * side, _BACK_WALL)]
-        return Staging(ahead, clear=[k for t in targets for k in _line_of_sight(path, t, (30,))])
+        front_wall = FrontWall(0.95 * side, mirror_x=-1.15 * side, glazed=True, garden=True, sky_strength=EVENING_SKY)
+        targets = [(front_wall.window_x, _BACK_WALL), (-1.15 * side, _BACK_WALL)]
+        return Staging(front_wall, clear=[k for t in targets for k in _line_of_sight(path, t, (30,))])
     if kind == "swinging":
         apple = _in_view(path, views, lambda x, y: 0.0, 1.3)
         return Staging(apple=apple, clear=[Keepout(*apple, 0.35), *_line_of_sight(path, apple)])
@@ -91,19 +91,23 @@ def stage(kind: str, seed: int, path: Array, views: Array) -> Staging:
         first = _in_view(path, views, lambda x, y: 0.0, 1.4)
         return Staging(first=first, clear=_line_of_sight(path, first))
     if kind == "hair":
-        ahead = WallAhead(0.0, window_width=BRIGHT_WINDOW, sky_strength=BRIGHT_SKY)
+        front_wall = FrontWall(0.0, window_width=BRIGHT_WINDOW, sky_strength=BRIGHT_SKY)
         first = _in_view(path, views, lambda x, y: _before_window(path, x, y, BRIGHT_WINDOW), 1.4)
-        return Staging(ahead, first, clear=[*_line_of_sight(path, first), *_line_of_sight(path, (0.0, _BACK_WALL))])
+        return Staging(
+            front_wall, first, clear=[*_line_of_sight(path, first), *_line_of_sight(path, (0.0, _BACK_WALL))]
+        )
     return Staging()
 
 
-def _in_view(path: Array, views: Array, better: Callable[[float, float], float], away: float) -> tuple[float, float]:
-    """x, y that most views show, at least `away` metres from the camera's path but close to it."""
+def _in_view(
+    path: Array, views: Array, better: Callable[[float, float], float], from_path: float
+) -> tuple[float, float]:
+    """x, y that most views show, at least `from_path` metres from the camera's path but close to it."""
     best, found = -np.inf, (0.0, 1.0)
     for x in np.arange(-1.5, 1.55, 0.1):
         for y in np.arange(-1.0, 2.65, 0.1):
             distance = np.hypot(path[:, 0] - x, path[:, 1] - y)
-            if distance.min() < away:
+            if distance.min() < from_path:
                 continue
             score = share_in_view(views, np.array([x, y, 1.3])) + better(x, y) - 0.03 * distance.mean()
             if score > best:
@@ -122,9 +126,9 @@ def _line_of_sight(path: Array, target: tuple[float, float], at: tuple[int, ...]
     """Discs between some points of the path and a target, ending 0.5 m before both."""
     discs = []
     for eye in path[list(at)]:
-        away = np.asarray(target) - eye
-        length = float(np.hypot(*away))
-        points = eye + away * np.arange(0.5, length - 0.5, 0.3)[:, None] / length
+        offset = np.asarray(target) - eye
+        length = float(np.hypot(*offset))
+        points = eye + offset * np.arange(0.5, length - 0.5, 0.3)[:, None] / length
         discs += [Keepout(float(x), float(y), 0.25) for x, y in points]
     return discs
 
@@ -134,7 +138,7 @@ def _line_of_sight(path: Array, target: tuple[float, float], at: tuple[int, ...]
 
 def apple(
     folder: Path, seed: int, seconds: Array, place: tuple[float, float], path: Array
-) -> tuple[Array, Mesh, Thing]:
+) -> tuple[Array, Mesh, SceneObject]:
     """(vertices [T, V, 3], mesh, thing) of an apple swinging on its thread; writes textures/apple.png."""
     rng = stream(seed, "apple")
     write_png(folder / "textures" / "apple.png", _apple_skin(rng))
@@ -152,7 +156,7 @@ def apple(
     sideways, deep = (m / length * np.sin(turn + p) for m, p in zip(SWING_METRES, phase, strict=True))
     turns = _turns((2, 0), sideways) @ _turns((1, 2), deep)
     vertices = np.einsum("tij,vj->tvi", turns, mesh.vertices) + np.array([*place, THREAD_TOP])
-    return vertices, mesh, Thing("swinging", "apple", faces, np.ones(len(faces), bool))
+    return vertices, mesh, SceneObject("swinging", "apple", faces, np.ones(len(faces), bool))
 
 
 def _turns(axes: tuple[int, int], angles: Array) -> Array:
@@ -174,13 +178,13 @@ def _apple_skin(rng: np.random.Generator) -> NDArray[np.uint8]:
     return np.round(255.0 * np.clip(skin, 0.0, 1.0)).astype(np.uint8)
 
 
-def arm_of(bodies: Bodies, name: str) -> Thing:
+def arm_of(bodies: Bodies, name: str) -> SceneObject:
     """A person's right arm: triangles that mostly follow its bones."""
     faces = bodies.influence["right_arm"][bodies.triangles].mean(axis=1) > 0.5
-    return Thing("arm", name, faces, faces)
+    return SceneObject("arm", name, faces, faces)
 
 
-def hair_of(folder: Path, bodies: Bodies, body: Body, seed: int, seconds: Array) -> tuple[Array, Mesh, Thing]:
+def hair_of(folder: Path, bodies: Bodies, body: Body, seed: int, seconds: Array) -> tuple[Array, Mesh, SceneObject]:
     """(vertices [T, V, 3], mesh, thing) of loose strands that follow a head; writes textures/hair.png."""
     rng = stream(seed, "hair")
     tone = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.7), rng.uniform(0.15, 0.55))
@@ -203,7 +207,7 @@ def hair_of(folder: Path, bodies: Bodies, body: Body, seed: int, seconds: Array)
     uv = np.full((len(triangles), 3, 2), 0.5, np.float32)
     mesh = Mesh(vertices[0].astype(np.float32), triangles, uv, np.zeros(len(triangles), np.int32))
     every = np.ones(len(triangles), bool)
-    return vertices, mesh, Thing("hair", "hair", every, ~every)
+    return vertices, mesh, SceneObject("hair", "hair", every, ~every)
 
 
 def _roots(bodies: Bodies, start: Array, head: NDArray[np.bool_], rng: np.random.Generator) -> tuple[Array, Array]:

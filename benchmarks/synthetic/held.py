@@ -19,7 +19,7 @@ from torch_backend.footage.images import write_png
 
 from .cameras import CameraMove
 from .geometry import Builder, Mesh
-from .hard import Thing, share_in_view
+from .hard import SceneObject, share_in_view
 from .noise import Array, fractal, smooth_step, stream
 from .places import Furnisher, Keepout
 from .sizes import Size
@@ -84,7 +84,7 @@ _STRIDE: Pose = {
     "upperleg01.R": (16, 0, 0),
     "lowerleg01.R": (24, 0, 0),
 }
-_OTHER_STRIDE: Pose = {bone[:-1] + ("R" if bone.endswith("L") else "L"): v for bone, v in _STRIDE.items()}
+_MIRRORED_STRIDE: Pose = {bone[:-1] + ("R" if bone.endswith("L") else "L"): v for bone, v in _STRIDE.items()}
 _LEGS_DOWN: Pose = dict.fromkeys(_STRIDE, (0, 0, 0))
 
 
@@ -98,12 +98,12 @@ class Part:
     """Seconds at which the change begins."""
     end: float
     """Seconds at which the change ends."""
-    things: list[Thing] = field(default_factory=list)
+    objects: list[SceneObject] = field(default_factory=list)
     """The held thing, as triangles of a mover; set by `perform`."""
     movers: list[str] = field(default_factory=list)
     """Names of all movers changed by the role; set by `perform`."""
 
-    def other_time(self, seconds: float) -> float:
+    def time_in_other_state(self, seconds: float) -> float:
         """A time in the other state, for a state at `seconds`."""
         return self.end + 0.25 if seconds < 0.5 * (self.begin + self.end) else self.begin - 0.25
 
@@ -203,9 +203,9 @@ def _spot(
 ) -> _Spot | None:
     """A random place for a role with its props; None if it blocks the camera or exceeds the room."""
     place = np.array([rng.uniform(-2.3, 2.3), rng.uniform(-1.4, 2.2)])
-    away = eyes[len(eyes) // 2] - place
-    away = away / np.linalg.norm(away)
-    facing = float(np.arctan2(away[0], -away[1]))
+    offset = eyes[len(eyes) // 2] - place
+    offset = offset / np.linalg.norm(offset)
+    facing = float(np.arctan2(offset[0], -offset[1]))
     # The body faces (sin, -cos) of its heading. If it is turned to its left, the right arm is nearer to the camera.
     turned = {RAISED: 0.0, TURNED: 0.0, RESTING: 40.0, SET_DOWN: 55.0}
     solid, column = [np.array([*place, 0.3])], None
@@ -218,13 +218,13 @@ def _spot(
             return None
     else:
         heading = facing + np.radians(turned[role])
-    ahead = np.array([np.sin(heading), -np.cos(heading)])
+    forward = np.array([np.sin(heading), -np.cos(heading)])
     right = np.array([-np.cos(heading), -np.sin(heading)])
-    middle = place + {RAISED: 0.3 * right, RESTING: 0.25 * ahead, SET_DOWN: 0.25 * ahead}.get(role, 0.0 * ahead)
+    middle = place + {RAISED: 0.3 * right, RESTING: 0.25 * forward, SET_DOWN: 0.25 * forward}.get(role, 0.0 * forward)
     if role in (RESTING, SET_DOWN):
-        solid.append(np.array([*(place + 0.45 * ahead), 0.35]))
+        solid.append(np.array([*(place + 0.45 * forward), 0.35]))
     if role == RAISED and seed % 2 == 0:
-        solid.append(np.array([*(place - PANEL_BEHIND * away), 0.5]))
+        solid.append(np.array([*(place - PANEL_BEHIND * offset), 0.5]))
     if role == TURNED:
         column = _column(place, 0.5 * sum(time), camera)
         solid.append(column)
@@ -239,8 +239,8 @@ def _column(place: Array, middle: float, camera: CameraMove) -> Array:
     eyes = _eyes(views)
     at = place + COLUMN_SHARE * (eyes[4] - place)
     lines = (eyes - place) / np.linalg.norm(eyes - place, axis=1, keepdims=True)
-    off = np.abs(lines[:, 0] * (at - place)[1] - lines[:, 1] * (at - place)[0]).max()
-    return np.array([*at, off + HEAD_RADIUS * (1.0 - COLUMN_SHARE)])
+    distance = np.abs(lines[:, 0] * (at - place)[1] - lines[:, 1] * (at - place)[0]).max()
+    return np.array([*at, distance + HEAD_RADIUS * (1.0 - COLUMN_SHARE)])
 
 
 def _walks_to(place: tuple[float, float], heading: float) -> tuple[float, float]:
@@ -265,11 +265,11 @@ class _Sight:
     @classmethod
     def of(cls, spot: _Spot, time: tuple[float, float], seconds: Array, views: Array) -> _Sight:
         """The visibility of a spot whose change takes `time`, in views [T] at seconds [T]."""
-        away = _eyes(views) - spot.middle
-        length = np.linalg.norm(away, axis=1)
+        offset = _eyes(views) - spot.middle
+        length = np.linalg.norm(offset, axis=1)
         point = np.array([*spot.middle, 1.2])
         in_view = np.array([share_in_view(views[i : i + 1], point) > 0.5 for i in range(len(views))])
-        sight = cls(spot, away / length[:, None], length, in_view, (seconds < time[0], seconds > time[1]))
+        sight = cls(spot, offset / length[:, None], length, in_view, (seconds < time[0], seconds > time[1]))
         if spot.column is not None:
             sight.in_view &= sight._is_open([spot.column])
         return sight
@@ -279,13 +279,13 @@ class _Sight:
         is_open, width = np.ones(len(self.length), bool), HEAD_RADIUS if self.spot.column is not None else ARM_RADIUS
         for x, y, radius in discs:
             to = np.array([x, y]) - self.spot.middle
-            along, off = self.lines @ to, np.abs(self.lines[:, 0] * to[1] - self.lines[:, 1] * to[0])
-            is_open &= (along < 0.0) | (along > self.length) | (off > radius + width * (1.0 - along / self.length))
+            along, distance = self.lines @ to, np.abs(self.lines[:, 0] * to[1] - self.lines[:, 1] * to[0])
+            is_open &= (along < 0.0) | (along > self.length) | (distance > radius + width * (1.0 - along / self.length))
         return is_open
 
-    def shown(self, others: list[_Sight]) -> float:
+    def shown(self, neighbours: list[_Sight]) -> float:
         """Share of the views that see the spot past other spots, in the less visible state; reduced with distance."""
-        shown = self.in_view & self._is_open([disc for other in others for disc in other.spot.solid])
+        shown = self.in_view & self._is_open([disc for neighbour in neighbours for disc in neighbour.spot.solid])
         return float(min(shown[state].mean() for state in self.states)) - 0.04 * float(self.length.mean())
 
 
@@ -307,10 +307,10 @@ def _layout(choices: list[list[_Sight]], rng: np.random.Generator) -> list[_Sigh
 def _worth(layout: list[_Sight]) -> float:
     """Score of a layout's visibility, mainly of the least visible role; -inf if two spots overlap."""
     for a, b in itertools.combinations(layout, 2):
-        for one, other in itertools.product(a.spot.solid, b.spot.solid):
-            if np.hypot(*(one[:2] - other[:2])) < one[2] + other[2] + 0.15:
+        for one, second in itertools.product(a.spot.solid, b.spot.solid):
+            if np.hypot(*(one[:2] - second[:2])) < one[2] + second[2] + 0.15:
                 return -np.inf
-    shares = [sight.shown([other for other in layout if other is not sight]) for sight in layout]
+    shares = [sight.shown([second for second in layout if second is not sight]) for sight in layout]
     return min(shares) + 0.3 * float(np.mean(shares))
 
 
@@ -352,7 +352,7 @@ def _changes(role: str, time: tuple[float, float], rng: np.random.Generator) -> 
     if role == SET_DOWN:
         return (*before, _HOLDS), (begin, half, _OVER_TABLE), (half, end, _ARM_DOWN)
     steps = np.linspace(begin, end, 5)
-    poses = (_STRIDE, _OTHER_STRIDE, _STRIDE, _LEGS_DOWN)
+    poses = (_STRIDE, _MIRRORED_STRIDE, _STRIDE, _LEGS_DOWN)
     return tuple((float(a), float(b), pose) for (a, b), pose in zip(itertools.pairwise(steps), poses, strict=True))
 
 
@@ -390,9 +390,9 @@ def perform(
     if role == SET_DOWN:
         extras.append(_set_down(folder, part, bodies, body, furnisher, seed, seconds))
         part.movers.append(extras[0][0])
-        part.things = [Thing(role, extras[0][0], every := np.ones(len(extras[0][2].triangles), bool), every)]
+        part.objects = [SceneObject(role, extras[0][0], every := np.ones(len(extras[0][2].triangles), bool), every)]
     else:
-        part.things = [Thing(role, name, faces, faces)]
+        part.objects = [SceneObject(role, name, faces, faces)]
     return extras
 
 
@@ -408,8 +408,8 @@ def _faces(influence: Array, body: Body) -> NDArray[np.bool_]:
 
 def _table(furnisher: Furnisher, person: Person, above: Array, height: float) -> None:
     """Adds a round table with its top at `height` below points [P, 3], offset away from the person."""
-    ahead = np.array([np.sin(person.heading), -np.cos(person.heading)])
-    x, y = above[:, :2].mean(axis=0) + 0.08 * ahead
+    forward = np.array([np.sin(person.heading), -np.cos(person.heading)])
+    x, y = above[:, :2].mean(axis=0) + 0.08 * forward
     wood = furnisher.material("planks")
     furnisher.build.cylinder([x, y, 0.0], 0.18, 0.03, wood)
     furnisher.build.cylinder([x, y, 0.03], 0.03, height - 0.06, wood, 12)
@@ -449,12 +449,12 @@ def _set_down(
     from .textures import TEXTURES
 
     heading = part.person.heading
-    ahead = np.array([np.sin(heading), -np.cos(heading), 0.0])
+    forward = np.array([np.sin(heading), -np.cos(heading), 0.0])
     hands = body.vertices[:, bodies.influence["right_hand"] > 0.9].mean(axis=1).astype(np.float64)
     half = 0.5 * (part.begin + part.end)
     down = hands[_index(seconds, half)]
-    held = smooth_step(seconds, half - 0.05, half + 0.05)[:, None]
-    at = (1.0 - held) * hands + held * down + 0.1 * ahead
+    progress = smooth_step(seconds, half - 0.05, half + 0.05)[:, None]
+    at = (1.0 - progress) * hands + progress * down + 0.1 * forward
     builder = Builder([0.0])
     builder.box([0.0, 0.0, 0.0], BOX_SIZE, 0, heading)
     mesh = builder.mesh()

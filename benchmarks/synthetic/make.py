@@ -57,10 +57,10 @@ def default_folder() -> Path:
     return base / "splannequin" / "synthetic"
 
 
-def find_bpy(given: str | Path | None) -> Path:
-    """The Python of an environment with a bpy wheel. `given`: that Python, its environment's folder, or None."""
+def find_bpy(requested: str | Path | None) -> Path:
+    """The Python of an environment with a bpy wheel. `requested`: that Python, its environment's folder, or None."""
     home = Path(os.environ.get("SPLANNEQUIN_HOME") or ROOT).expanduser()  # where set-up makes environments
-    places = [Path(given)] if given else [home / USUAL_BPY, *sorted(home.glob(".venv-bpy-*"), reverse=True)]
+    places = [Path(requested)] if requested else [home / USUAL_BPY, *sorted(home.glob(".venv-bpy-*"), reverse=True)]
     for place in places:
         for python in (place, place / "bin" / "python", place / "Scripts" / "python.exe"):
             if python.is_file():
@@ -100,11 +100,11 @@ def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: C
             shutil.rmtree(folder / part, ignore_errors=True)
         say(f"{size.name}/{folder.name}: geometry and textures")
         write_geometry(folder, seed, kind, size, key, bodies())
-    made = time.perf_counter()
+    start = time.perf_counter()
     render_pictures(folder, bpy, lambda text: say(f"{size.name}/{folder.name}: {text}"))
     rendered = time.perf_counter()
     write_regions(folder, seed, kind, size, _Eta(say, f"{size.name}/{folder.name}: regions"))
-    seconds = {"geometry": made - began, "pictures": rendered - made, "regions": time.perf_counter() - rendered}
+    seconds = {"geometry": start - began, "pictures": rendered - start, "regions": time.perf_counter() - rendered}
     write_record(folder, size, seed, kind, key, seconds)
     say(f"{size.name}/{folder.name}: finished, {sum(seconds.values()):.0f} s in this run")
     return folder

@@ -48,7 +48,7 @@ class Keepout:
 
 
 @dataclass(frozen=True)
-class WallAhead:
+class FrontWall:
     """Contents of the wall that the camera faces; x in metres, 0 at its centre."""
 
     window_x: float
@@ -82,9 +82,9 @@ class Place:
 class Furnisher:
     """Adds furniture to a place, away from the camera's path and people."""
 
-    def __init__(self, seed: int, path: Array, people: list[Keepout], ahead: WallAhead | None = None) -> None:
+    def __init__(self, seed: int, path: Array, people: list[Keepout], front_wall: FrontWall | None = None) -> None:
         self.seed = seed
-        self.ahead = ahead
+        self.front_wall = front_wall
         self.rng = stream(seed, "furniture")
         self.path = path
         self.occupied = list(people)
@@ -173,15 +173,15 @@ class Furnisher:
 
     def sofa(self, x: float, y: float, yaw: float) -> None:
         """Adds a sofa with back, arms and two cushions; it faces local -y."""
-        cloth, other = self.material("fabric"), self.material("fabric")
+        cloth, cushions = self.material("fabric"), self.material("fabric")
         c, s = np.cos(yaw), np.sin(yaw)
         parts = [
             ((0, 0, 0.22), (1.8, 0.8, 0.36), cloth),
             ((0, 0.34, 0.6), (1.8, 0.18, 0.5), cloth),
             ((-0.95, 0, 0.34), (0.16, 0.8, 0.6), cloth),
             ((0.95, 0, 0.34), (0.16, 0.8, 0.6), cloth),
-            ((-0.5, 0.18, 0.56), (0.45, 0.16, 0.36), other),
-            ((0.52, 0.18, 0.56), (0.45, 0.16, 0.36), other),
+            ((-0.5, 0.18, 0.56), (0.45, 0.16, 0.36), cushions),
+            ((0.52, 0.18, 0.56), (0.45, 0.16, 0.36), cushions),
         ]
         for (dx, dy, z), size, material in parts:
             self.build.box([x + c * dx - s * dy, y + s * dx + c * dy, z], size, material, yaw)
@@ -272,7 +272,7 @@ class Furnisher:
         self.build.rect([-half, front, 0], [2 * half, 0, 0], [0, depth, 0], floor)
         self.build.rect([-half, back, height], [2 * half, 0, 0], [0, -depth, 0], self.material("plaster"))
         window_wall = int(rng.integers(3))
-        if self.ahead:
+        if self.front_wall:
             window_wall = 0
         walls = [
             (np.array([-half, back, 0.0]), np.array([1.0, 0.0, 0.0]), 2 * half),
@@ -284,16 +284,16 @@ class Furnisher:
             window = None
             if index == window_wall:
                 middle = length * (0.5 if index == 0 else 0.35 if index == 1 else 0.65)
-                middle += self.ahead.window_x if self.ahead else 0.0
-                width = self.ahead.window_width if self.ahead else WINDOW_WIDTH
+                middle += self.front_wall.window_x if self.front_wall else 0.0
+                width = self.front_wall.window_width if self.front_wall else WINDOW_WIDTH
                 window = (middle - width / 2, middle + width / 2)
                 inward = np.array([along[1], -along[0], 0.0])
                 centre = origin + along * middle - inward * 0.05 + [0, 0, 1.55]
                 place.lights.append(_portal(centre, inward, width, 1.4))
             self.wall(origin, along, length, height, window)
             occupied = [window] if window else []
-            if self.ahead and index == 0:
-                occupied += self._panes(self.ahead, origin, half)
+            if self.front_wall and index == 0:
+                occupied += self._panes(self.front_wall, origin, half)
             self.posters(origin, along, length, 4 if index < 3 else 2, occupied)
         for x, y in ((-0.45 * half, -2.2), (0.45 * half, -2.2), (-0.45 * half, 1.6), (0.45 * half, 1.6)):
             place.lights.append(_panel([x, y, height - 0.06], 1.3, 0.5, 75.0))
@@ -301,27 +301,32 @@ class Furnisher:
         if rng.uniform() < 0.7:
             w, d = rng.uniform(2.0, 3.0), rng.uniform(1.6, 2.4)
             self.build.rect([-w / 2, 0.2 - d / 2, 0.006], [w, 0, 0], [0, d, 0], self.material("rug"))
-        if self.ahead:
-            for x in (self.ahead.window_x, self.ahead.mirror_x):
+        if self.front_wall:
+            for x in (self.front_wall.window_x, self.front_wall.mirror_x):
                 self.occupied += [Keepout(x + dx, back - 0.4, 0.3) for dx in (-0.7, 0.0, 0.7)] if x is not None else []
         self._against_walls(half, back)
         self._in_the_middle(half, back, height)
-        if self.ahead and self.ahead.garden:
-            self._garden(self.ahead.window_x, back)
-        place.sky, place.sky_strength = str(rng.choice(ROOM_SKIES)), self.ahead.sky_strength if self.ahead else 1.6
+        if self.front_wall and self.front_wall.garden:
+            self._garden(self.front_wall.window_x, back)
+        place.sky, place.sky_strength = (
+            str(rng.choice(ROOM_SKIES)),
+            self.front_wall.sky_strength if self.front_wall else 1.6,
+        )
         place.sky_turn = float(rng.uniform(0, 2 * np.pi))
         return place, self.build.mesh()
 
-    def _panes(self, ahead: WallAhead, origin: Array, half: float) -> list[tuple[float, float]]:
+    def _panes(self, front_wall: FrontWall, origin: Array, half: float) -> list[tuple[float, float]]:
         """Adds the mirror and the window's pane to the wall ahead; returns the spans covered by the mirror."""
         along = np.array([1.0, 0.0, 0.0])
-        if ahead.glazed:
-            at = origin + along * (half + ahead.window_x - ahead.window_width / 2) + [0, 0, WINDOW_LOW]
-            self.place.panes.append(Pane.of(GLASS, at, along * ahead.window_width, [0, 0, WINDOW_HIGH - WINDOW_LOW]))
-        if ahead.mirror_x is None:
+        if front_wall.glazed:
+            at = origin + along * (half + front_wall.window_x - front_wall.window_width / 2) + [0, 0, WINDOW_LOW]
+            self.place.panes.append(
+                Pane.of(GLASS, at, along * front_wall.window_width, [0, 0, WINDOW_HIGH - WINDOW_LOW])
+            )
+        if front_wall.mirror_x is None:
             return []
         width, height = MIRROR_SIZE
-        start = half + ahead.mirror_x - width / 2
+        start = half + front_wall.mirror_x - width / 2
         at = origin + along * start + [0, -0.025, MIRROR_LOW]
         self.place.panes.append(Pane.of(MIRROR, at, along * width, [0, 0, height]))
         board = origin + along * (start + width / 2) + [0, -0.011, MIRROR_LOW + height / 2]

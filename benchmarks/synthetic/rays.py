@@ -94,9 +94,9 @@ class RayScene:
 
     def clear(self, begin: NDArray, end: NDArray) -> NDArray[np.bool_]:
         """bool [P]: no triangle is between points `begin` [P, 3] and `end` [P, 3]; surfaces at `end` are ignored."""
-        away = end - begin
-        length = np.linalg.norm(away, axis=1)
-        return self.cast(begin, away).distance * length >= length - SLACK
+        offset = end - begin
+        length = np.linalg.norm(offset, axis=1)
+        return self.cast(begin, offset).distance * length >= length - SLACK
 
     def escapes(self, eye: NDArray, directions: NDArray) -> NDArray[np.bool_]:
         """bool [R]: rays from `eye` [3] along `directions` [R, 3] hit nothing."""

@@ -10,11 +10,11 @@ In a mirror the reflected point counts: it is seen at t* if the mirror shows it 
 glass either layer may move; *seen* refers to the point behind the glass. Depth is the mirror's own, and that of the
 point behind glass.
 
-Hard scenes have masks of their things (`Regions.things`). `glass` and `mirror` are the pixels of panes in which nothing
+Hard scenes have masks of objects (`Regions.objects`). `glass` and `mirror` are the pixels of panes in which nothing
 moves, `wall` those of the surrounding still wall within `WALL_METRES` of a pane. `swinging`, `arm` and `hair` are the
 pixels whose centre shows the thing. Hair is thinner than a pixel: a pixel is hair if at least `HAIR_SHARE` of
 `HAIR_RAYS` squared rays through it hit a strand. Scenes of kind `held` have a mask per held thing, and the region
-`held`: see `held_elsewhere`.
+`held`: see `held_change_mask`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from .generate import camera_of, frame_name, frame_number, frame_seconds
 from .noise import Array
 from .panes import MIRROR, Pane
 from .rays import Hits, RayScene
-from .sizes import HELD, MOVING_PX, THING, Size
+from .sizes import HELD, MOVING_PX, OBJECT_PREFIX, Size
 
 DEPTH_STEPS_PER_METRE = 1000.0
 HAIR_RAYS, HAIR_SHARE = 4, 0.15
@@ -45,7 +45,7 @@ NUDGE = 1e-4
 """Offset in metres of a reflected ray's origin in front of the pane."""
 STILL_SECONDS = 0.5
 """Seconds before and after a plate without motion in a pixel of the region `held`."""
-ELSEWHERE_METRES, SWAY_METRES = 0.04, 0.02
+DISPLACED_METRES, SWAY_METRES = 0.04, 0.02
 """Displacements in metres: above the first a surface point counts as elsewhere, up to the second as still. See
 docs/synthetic.md for the sway of people who hold still."""
 WALL_METRES, WALL_DEPTH = 0.6, 0.04
@@ -65,7 +65,7 @@ class Geometry:
     """[F, 3]."""
     panes: list[Pane]
     """Panes, which are not among the triangles."""
-    things: dict[str, NDArray[np.bool_]]
+    objects: dict[str, NDArray[np.bool_]]
     """{name of a hard scene's thing: [F] mask of its triangles}."""
 
     @classmethod
@@ -75,7 +75,7 @@ class Geometry:
         with np.load(folder / "geometry" / "static.npz", allow_pickle=False) as data:
             static, triangles = data["vertices"], [data["triangles"]]
         moving, at = [], len(static)
-        things, starts, faces = _thing_faces(folder, plan), {}, len(triangles[0])
+        objects, starts, faces = _object_faces(folder, plan), {}, len(triangles[0])
         for mover in plan["movers"]:
             if not mover["in_view"]:
                 continue
@@ -87,8 +87,8 @@ class Geometry:
             starts[mover["name"]] = faces
             faces += len(triangles[-1])
         panes = [Pane.from_json(pane) for pane in plan.get("panes", [])]
-        its = {name: np.zeros(faces, bool) for name, _, _ in things}
-        for name, mover, chosen in things:
+        its = {name: np.zeros(faces, bool) for name, _, _ in objects}
+        for name, mover, chosen in objects:
             its[name][starts[mover] : starts[mover] + len(chosen)] = chosen
         return cls(static, np.concatenate(moving, axis=1), np.concatenate(triangles), panes, its)
 
@@ -97,7 +97,7 @@ class Geometry:
         return RayScene(np.concatenate([self.static, self.moving[index]]), self.triangles)
 
 
-def _thing_faces(folder: Path, plan: dict[str, Any]) -> list[tuple[str, str, NDArray[np.bool_]]]:
+def _object_faces(folder: Path, plan: dict[str, Any]) -> list[tuple[str, str, NDArray[np.bool_]]]:
     """(name, mover, mask of the mover's triangles) of every thing of a hard scene."""
     found: list[tuple[str, str, NDArray[np.bool_]]] = []
     if "thing" in plan:
@@ -161,13 +161,13 @@ def write_regions(folder: Path, seed: int, kind: str, size: Size, progress: Call
     for index, missing in todo.items():
         scene = standing(index)
         for pose, path in missing:
-            own = views[index]
-            maps = region_maps(geometry, scene, index, own if pose is None else views[pose], own)
+            frame_view = views[index]
+            maps = region_maps(geometry, scene, index, frame_view if pose is None else views[pose], frame_view)
             if pose is None:
                 del maps["seen"]
             elif kind == "held":
                 window = round(STILL_SECONDS * size.fps)
-                maps[THING + HELD] = held_elsewhere(geometry, standing, index, pose, views[pose], window)
+                maps[OBJECT_PREFIX + HELD] = held_change_mask(geometry, standing, index, pose, views[pose], window)
             with atomic_path(path) as partial:
                 np.savez_compressed(partial, **maps)
             done += 1
@@ -181,10 +181,10 @@ def views_of(seed: int, size: Size, kind: str = "plain") -> list[View]:
     return [View(matrix, K, size.width, size.height) for matrix in matrices]
 
 
-def region_maps(geometry: Geometry, scene: RayScene, index: int, view: View, own: View) -> dict[str, Any]:
+def region_maps(geometry: Geometry, scene: RayScene, index: int, view: View, frame_view: View) -> dict[str, Any]:
     """depth_mm uint16 [H, W] (0: sky), moving and seen bool [H, W] of the scene of frame `index` from `view`.
 
-    `own` is the clip's camera at that frame.
+    `frame_view` is the clip's camera at that frame.
     """
     rays = view.rays()
     eye = view.eye
@@ -195,21 +195,21 @@ def region_maps(geometry: Geometry, scene: RayScene, index: int, view: View, own
     points = eye + rays * np.where(sky, 1.0, hits.distance)[:, None]
     seen = np.zeros(len(rays), bool)
     solid = ~sky
-    pixels, z = own.project(points[solid])
-    seen[solid] = own.shows(pixels, z) & scene.sees(own.eye, points[solid])
+    pixels, z = frame_view.project(points[solid])
+    seen[solid] = frame_view.shows(pixels, z) & scene.sees(frame_view.eye, points[solid])
     if sky.any():
-        pixels, z = own.project(rays[sky], at_infinity=True)
-        seen[sky] = own.shows(pixels, z) & scene.escapes(own.eye, rays[sky])
+        pixels, z = frame_view.project(rays[sky], at_infinity=True)
+        seen[sky] = frame_view.shows(pixels, z) & scene.escapes(frame_view.eye, rays[sky])
     moving = _moving(geometry, hits, index, view.project)
-    shown = [show_pane(geometry, scene, pane, hits, index, view, own) for pane in geometry.panes]
+    shown = [show_pane(geometry, scene, pane, hits, index, view, frame_view) for pane in geometry.panes]
     for pane, pane_view in zip(geometry.panes, shown, strict=True):
         moving[pane_view.rays] |= pane_view.moving
         if pane.kind == MIRROR:
             depth[pane_view.rays] = np.round(pane_view.distance * DEPTH_STEPS_PER_METRE)
             moving[pane_view.rays], seen[pane_view.rays] = pane_view.moving, pane_view.seen
-    things = _things(geometry, scene, hits, view, moving, shown)
+    objects = _object_masks(geometry, scene, hits, view, moving, shown)
     maps = {"depth_mm": depth.astype(np.uint16), "moving": moving, "seen": seen}
-    maps |= {THING + name: mask for name, mask in things.items()}
+    maps |= {OBJECT_PREFIX + name: mask for name, mask in objects.items()}
     return {name: values.reshape(view.height, view.width) for name, values in maps.items()}
 
 
@@ -227,7 +227,9 @@ class Shown:
     """[R] whether the pane also shows it in the clip's own frame."""
 
 
-def show_pane(geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index: int, view: View, own: View) -> Shown:
+def show_pane(
+    geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index: int, view: View, frame_view: View
+) -> Shown:
     """Reflections of an unoccluded pane in a view of frame `index`; `hits` are those of the view."""
     rays = view.rays()
     distance = pane.distance_to(view.eye, rays)
@@ -245,17 +247,17 @@ def show_pane(geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index
     if hit.any():
         # The image of the point is seen from `own.eye` if the line to it hits the pane and is unoccluded.
         images = pane.mirrored(points[hit])
-        away = images - own.eye
-        through = own.eye + away * pane.distance_to(own.eye, away)[:, None].clip(max=1.0)
-        pixels, z = own.project(images)
-        open_way = own.shows(pixels, z) & (pane.distance_to(own.eye, away) < 1.0)
-        open_way &= scene.sees(own.eye, through)
+        offset = images - frame_view.eye
+        through = frame_view.eye + offset * pane.distance_to(frame_view.eye, offset)[:, None].clip(max=1.0)
+        pixels, z = frame_view.project(images)
+        open_way = frame_view.shows(pixels, z) & (pane.distance_to(frame_view.eye, offset) < 1.0)
+        open_way &= scene.sees(frame_view.eye, through)
         open_way &= scene.clear(through + NUDGE * pane.normal, points[hit])
         seen[hit] = open_way
     return Shown(which, distance[which], _moving(geometry, reflected, index, image), seen)
 
 
-def _things(
+def _object_masks(
     geometry: Geometry, scene: RayScene, hits: Hits, view: View, moving: NDArray[np.bool_], shown: list[Shown]
 ) -> dict[str, NDArray[np.bool_]]:
     """Masks [R] of a hard scene's things, as described in this module."""
@@ -269,7 +271,7 @@ def _things(
         points = view.eye + view.rays() * np.where(still, hits.distance, 0.0)[:, None]
         near = [p.within(points, WALL_METRES) & (np.abs(p.above(points)) < WALL_DEPTH) for p in geometry.panes]
         masks["wall"] = still & np.any(near, axis=0)
-    for name, its in geometry.things.items():
+    for name, its in geometry.objects.items():
         if name == "hair":
             share = np.zeros(len(hits.face))
             at = (np.arange(HAIR_RAYS) + 0.5) / HAIR_RAYS
@@ -305,7 +307,7 @@ def _moving(
     return moving
 
 
-def held_elsewhere(
+def held_change_mask(
     geometry: Geometry, standing: Callable[[int], RayScene], index: int, pose: int, view: View, window: int
 ) -> NDArray[np.bool_]:
     """[H, W] still pixels in which plate `pose` shows another state than the scene of frame `index`.
@@ -320,8 +322,8 @@ def held_elsewhere(
     rays = view.rays()
     origins = np.broadcast_to(view.eye, rays.shape)
     truth, plate = (standing(time).cast(origins, rays) for time in (index, pose))
-    mask = _displaced(geometry, truth, index, pose) > ELSEWHERE_METRES
-    mask |= _displaced(geometry, plate, pose, index) > ELSEWHERE_METRES
+    mask = _displaced(geometry, truth, index, pose) > DISPLACED_METRES
+    mask |= _displaced(geometry, plate, pose, index) > DISPLACED_METRES
     which = np.flatnonzero(mask)
     plate = Hits(plate.distance[which], plate.face[which], plate.barycentric[which])
     for time in range(max(0, pose - window), min(len(geometry.moving), pose + window + 1)):
@@ -331,12 +333,12 @@ def held_elsewhere(
     return mask.reshape(view.height, view.width)
 
 
-def _displaced(geometry: Geometry, hits: Hits, time: int, other: int) -> Array:
-    """[R] distance in metres of surface points hit by rays at frame `time` from their positions at frame `other`."""
+def _displaced(geometry: Geometry, hits: Hits, time: int, target_time: int) -> Array:
+    """[R] distance in metres of surface points hit by rays at frame `time` from their positions at `target_time`."""
     corners = geometry.triangles[np.maximum(hits.face, 0)] - len(geometry.static)
     which = np.flatnonzero((hits.face >= 0) & (corners[:, 0] >= 0))
     moved = np.zeros(len(hits.face))
     if len(which):
-        apart = geometry.moving[other][corners[which]] - geometry.moving[time][corners[which]]
-        moved[which] = np.linalg.norm(np.einsum("nk,nkd->nd", hits.barycentric[which], apart), axis=1)
+        shift = geometry.moving[target_time][corners[which]] - geometry.moving[time][corners[which]]
+        moved[which] = np.linalg.norm(np.einsum("nk,nkd->nd", hits.barycentric[which], shift), axis=1)
     return moved

@@ -61,7 +61,7 @@ class Stage:
 
     def __init__(self, folder: Path, plan: dict[str, Any]) -> None:
         self.folder, self.plan, self.oversize = folder, plan, plan["oversize"]
-        self.thing = self.without = None
+        self.key_object = self.without = None
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
         self._settings()
@@ -79,13 +79,13 @@ class Stage:
         self.movers: list[tuple[Any, np.ndarray]] = []
         self.mover_names: dict[str, int] = {}
         for mover in plan["movers"]:
-            made = self._mesh(mover["name"], [self._material(mover["texture"], 0.0)], smooth=True)
-            made.visible_camera = mover["in_view"]
+            created = self._mesh(mover["name"], [self._material(mover["texture"], 0.0)], smooth=True)
+            created.visible_camera = mover["in_view"]
             path = folder / "geometry" / f"{mover['name']}.npy"
             self.mover_names[mover["name"]] = len(self.movers)
-            self.movers.append((made.data, np.load(path, mmap_mode="r", allow_pickle=False)))
+            self.movers.append((created.data, np.load(path, mmap_mode="r", allow_pickle=False)))
             if mover["name"] == plan.get("thing", {}).get("mover"):
-                self.thing, self.without = made, self._without(mover, made)
+                self.key_object, self.without = created, self._without(mover, created)
         self.time: tuple[float, dict[str, float]] | None = None
         camera = bpy.data.cameras.new("camera")
         camera.sensor_fit, camera.sensor_width = "HORIZONTAL", 36.0
@@ -153,9 +153,9 @@ class Stage:
         tree.links.new(self._with_panes(tree, mixed, mixed("ADD", lit, shining)), output.inputs[0])
 
     def _collection(self, name: str) -> Any:
-        made = bpy.data.collections.new(name)
-        self.scene.collection.children.link(made)
-        return made
+        created = bpy.data.collections.new(name)
+        self.scene.collection.children.link(created)
+        return created
 
     def _reflections(self) -> None:
         """Adds the panes, in a view layer that shows only their reflections; the other layer excludes them.
@@ -170,10 +170,10 @@ class Stage:
             corners = (origin, origin + along, origin + along + up, origin + up)
             mesh.from_pydata([corner.tolist() for corner in corners], [], [range(4)])
             mesh.materials.append(self._pane_material(pane["kind"]))
-            made = bpy.data.objects.new(mesh.name, mesh)
+            created = bpy.data.objects.new(mesh.name, mesh)
             for ray in ("diffuse", "glossy", "transmission", "shadow", "volume_scatter"):
-                setattr(made, f"visible_{ray}", False)
-            panes.objects.link(made)
+                setattr(created, f"visible_{ray}", False)
+            panes.objects.link(created)
         layer = self.scene.view_layers.new("reflections")
         for name in ("glossy_direct", "glossy_indirect", "glossy_color"):
             setattr(layer, f"use_pass_{name}", True)
@@ -215,23 +215,23 @@ class Stage:
         left = mixed("SUBTRACT", behind, mixed("MULTIPLY", behind, share))
         return mixed("ADD", left, denoise.outputs[0])
 
-    def _without(self, mover: dict[str, Any], made: Any) -> Any:
+    def _without(self, mover: dict[str, Any], created: Any) -> Any:
         """A mover without the triangles of the scene's thing, initially hidden; None if all or none are removed."""
         with np.load(self.folder / "geometry" / "thing.npz", allow_pickle=False) as data:
             gone = data["gone"]
         if gone.all() or not gone.any():
             return None
-        twin = self._mesh(mover["name"], [self._material(mover["texture"], 0.0)], smooth=True, kept=~gone)
-        self.movers.append((twin.data, self.movers[-1][1]))
-        twin.hide_render = True
-        return twin
+        remainder = self._mesh(mover["name"], [self._material(mover["texture"], 0.0)], smooth=True, kept=~gone)
+        self.movers.append((remainder.data, self.movers[-1][1]))
+        remainder.hide_render = True
+        return remainder
 
-    def _take_away(self, thing: bool) -> None:
+    def _hide_object(self, is_hidden: bool) -> None:
         """Hides the scene's thing, or shows it again."""
-        if self.thing:
-            self.thing.hide_render = thing
+        if self.key_object:
+            self.key_object.hide_render = is_hidden
         if self.without:
-            self.without.hide_render = not thing
+            self.without.hide_render = not is_hidden
 
     def _world(self) -> None:
         world = bpy.data.worlds.new("sky")
@@ -265,13 +265,13 @@ class Stage:
         else:
             light.shadow_soft_size, light.spot_size = spec["size"]
             light.spot_blend = 0.3
-        made = bpy.data.objects.new(light.name, light)
-        made.location = spec["location"]
-        made.rotation_euler = Vector(spec["direction"]).to_track_quat("-Z", "Y").to_euler()
-        made.visible_camera = False
+        created = bpy.data.objects.new(light.name, light)
+        created.location = spec["location"]
+        created.rotation_euler = Vector(spec["direction"]).to_track_quat("-Z", "Y").to_euler()
+        created.visible_camera = False
         if self.plan.get("panes"):
-            made.visible_glossy = False
-        self.collection.objects.link(made)
+            created.visible_glossy = False
+        self.collection.objects.link(created)
 
     def _material(self, file: str, emission: float) -> Any:
         material = bpy.data.materials.new(file)
@@ -308,9 +308,9 @@ class Stage:
         for each in materials:
             mesh.materials.append(each)
         mesh.update(calc_edges=True)
-        made = bpy.data.objects.new(name, mesh)
-        self.collection.objects.link(made)
-        return made
+        created = bpy.data.objects.new(name, mesh)
+        self.collection.objects.link(created)
+        return created
 
     def _go_to(self, time: float, elsewhen: dict[str, float]) -> None:
         """Moves all movers to a time in fractional frames, interpolated linearly between neighbouring frames.
@@ -320,8 +320,8 @@ class Stage:
         if (time, elsewhen) == self.time:
             return
         moments = [time] * len(self.movers)
-        for name, other in elsewhen.items():
-            moments[self.mover_names[name]] = other
+        for name, target_frame in elsewhen.items():
+            moments[self.mover_names[name]] = target_frame
         for moment, (mesh, vertices) in zip(moments, self.movers, strict=True):
             before = int(np.floor(moment))
             share = np.float32(moment - before)
@@ -363,9 +363,9 @@ class Stage:
         render.use_border = True
         render.border_min_x, render.border_max_x = left / width, right / width
         render.border_min_y, render.border_max_y = 1.0 - bottom / height, 1.0 - top / height
-        self._take_away(True)
+        self._hide_object(True)
         light[top:bottom, left:right] = self._exposed(job, job["bands"][0])[top:bottom, left:right]
-        self._take_away(False)
+        self._hide_object(False)
         render.border_min_x, render.border_max_x = 0.0, 1.0
 
     def _exposed(self, job: dict[str, Any], band: dict[str, Any]) -> np.ndarray:

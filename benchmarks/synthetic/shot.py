@@ -183,8 +183,8 @@ class SolvedPixels:
     def regions(self, regions: Regions) -> Regions:
         """The maps resampled by nearest pixel."""
         at = self._row, self._column
-        things = {name: mask[at] for name, mask in regions.things.items()}
-        return Regions(regions.depth[at], regions.moving[at], regions.seen[at], things)
+        objects = {name: mask[at] for name, mask in regions.objects.items()}
+        return Regions(regions.depth[at], regions.moving[at], regions.seen[at], objects)
 
 
 def _triangulated(scene: SyntheticScene, shot: Shot, names: list[str]) -> dict[str, NDArray] | None:

@@ -17,7 +17,7 @@ thread, an arm that waves or points, fine hair before a bright window, and thing
 (held.py)."""
 HELD = "held"
 """The kind of held.py, and the region of its truth that showed another state."""
-THING = "thing_"
+OBJECT_PREFIX = "thing_"
 """Prefix of a hard scene's mask names in its .npz files."""
 KINDS = ("plain", *LIMITS, *VERDICTS, *HARD)
 CAMERA_MOVES = ("forward", "pan", "return", "orbit")

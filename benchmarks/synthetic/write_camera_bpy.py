@@ -23,18 +23,18 @@ FILM_MM = 36.0
 
 def main(source: Path, files: list[Path]) -> None:
     """Creates the camera in an empty scene and exports it to each of the files."""
-    told = json.loads(source.read_text(encoding="utf-8"))
+    record = json.loads(source.read_text(encoding="utf-8"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene: Any = bpy.context.scene
-    numbers = [number for number, _ in told["frames"]]
+    numbers = [number for number, _ in record["frames"]]
     scene.frame_start, scene.frame_end = min(numbers), max(numbers)
-    scene.render.fps = max(1, round(told["fps"]))
-    scene.render.fps_base = scene.render.fps / told["fps"]
-    scene.render.resolution_x, scene.render.resolution_y = told["width"], told["height"]
-    camera = _camera(told)
+    scene.render.fps = max(1, round(record["fps"]))
+    scene.render.fps_base = scene.render.fps / record["fps"]
+    scene.render.resolution_x, scene.render.resolution_y = record["width"], record["height"]
+    camera = _camera(record)
     scene.collection.objects.link(camera)
     scene.camera = camera
-    for number, view in told["frames"]:
+    for number, view in record["frames"]:
         camera.matrix_world = Matrix((np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist())
         for path in ("location", "rotation_quaternion"):
             camera.keyframe_insert(path, frame=number)
@@ -46,10 +46,10 @@ def main(source: Path, files: list[Path]) -> None:
             bpy.ops.wm.usd_export(filepath=str(file), export_animation=True)
 
 
-def _camera(told: dict[str, Any]) -> Any:
+def _camera(record: dict[str, Any]) -> Any:
     """A camera with the pictures' lens; its principal point becomes Blender's shift, in units of the film's width."""
-    (fx, _, cx), (_, _, cy), _ = told["K"]
-    width, height = told["width"], told["height"]
+    (fx, _, cx), (_, _, cy), _ = record["K"]
+    width, height = record["width"], record["height"]
     data = bpy.data.cameras.new("matchmove")
     data.sensor_fit, data.sensor_width, data.sensor_height = "HORIZONTAL", FILM_MM, FILM_MM * height / width
     data.lens = fx / width * FILM_MM

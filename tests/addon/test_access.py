@@ -9,7 +9,7 @@ def access(addon):
     return addon("access")
 
 
-def test_settings_are_the_scenes_own(access, scene):
+def test_settings_belong_to_the_scene(access, scene):
     assert access.settings_of(scene) == scene.splannequin
     assert access.scene_holding(scene.splannequin) == scene
 

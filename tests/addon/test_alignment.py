@@ -12,7 +12,7 @@ def maths(addon):
     return addon("solve.alignment")
 
 
-def test_the_first_guess_stands_on_the_floor(addon, contract):
+def test_first_placement_puts_the_solve_on_the_floor(addon, contract):
     cameras = addon("solve.cameras")
     tilt = np.radians(25.0)  # the camera looks down at a table: its up vector leans forward
     right, down = np.array([1.0, 0, 0]), -np.array([0, np.sin(tilt), np.cos(tilt)])
@@ -28,7 +28,7 @@ def test_the_first_guess_stands_on_the_floor(addon, contract):
     np.testing.assert_allclose(leaning[:3, :3] @ -down, [0, 0, 1], atol=1e-12)
 
 
-def test_a_solve_stands_on_the_floor_that_it_found(addon, scene, shot):
+def test_solve_is_placed_on_its_detected_floor(addon, scene, shot):
     file = shot / "solve" / "solve.json"
     normal = np.array([0.1, -0.9, 0.3]) / np.linalg.norm([0.1, -0.9, 0.3])
     file.write_text(json.dumps({**json.loads(file.read_text()), "floor": {"normal": normal.tolist(), "height": 0.7}}))
@@ -112,7 +112,7 @@ def test_alignment_is_one_undo_step(addon, built, shot):
     np.testing.assert_allclose(root.matrix_world, stood, atol=1e-6)
 
 
-def test_points_on_a_line_leave_the_root_alone(addon, built, shot):
+def test_collinear_points_do_not_change_the_root(addon, built, shot):
     stood = np.array(addon("solve.cameras").find(built, shot, "EMPTY").matrix_world)
     with pytest.raises(RuntimeError, match="one line"):
         bpy.ops.splannequin.align_floor(places=[0, 0, 0, 1, 1, 1, 2, 2, 2])
@@ -129,8 +129,8 @@ def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, 
     addon("bake.insertion").insert_freeze(built, shot, "freeze")
     assert addon("bake.freeze_group").shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
     places = world(addon, built, shot)[[0, 1]]
-    apart = float(np.linalg.norm(places[1] - places[0]))
-    bpy.ops.splannequin.align_scale(places=places.ravel(), distance=3 * apart)
+    distance = float(np.linalg.norm(places[1] - places[0]))
+    bpy.ops.splannequin.align_scale(places=places.ravel(), distance=3 * distance)
     assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not addon(
         "bake.shown_take"
     ).stale_scale(built, shot)

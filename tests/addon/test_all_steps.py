@@ -41,7 +41,7 @@ def begun(chain, watch, remaining, step="solve"):
     return found
 
 
-def test_before_the_import_there_is_nothing_to_do(scene, chain):
+def test_no_step_is_missing_before_the_import(scene, chain):
     assert chain.missing(scene) == [] and not bpy.ops.splannequin.all_steps.poll()
 
 

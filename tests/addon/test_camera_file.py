@@ -73,12 +73,12 @@ def test_a_camera_comes_back_from_a_file(addon, filmed, shot, tmp_path, ending):
     params = addon("process.steps").STEPS["solve"].params(filmed)
     assert params.cameras == str(shot / "tracking" / "transforms.json") and filmed.frame_current == 40
     assert {kind: [b.name for b in getattr(bpy.data, kind)] for kind in kinds} == before
-    told = json.loads((shot / "tracking" / "transforms.json").read_text(encoding="utf-8"))
-    assert told["splannequin"] == {"world": "scene", "is_numbered_as_shot": False, "notes": []}
-    assert [f["file_path"] for f in told["frames"]] == ["5.png", "6.png", "7.png"]
-    for found, wanted in zip(told["frames"], seen(addon, filmed, camera), strict=True):
+    transforms = json.loads((shot / "tracking" / "transforms.json").read_text(encoding="utf-8"))
+    assert transforms["splannequin"] == {"world": "scene", "is_numbered_as_shot": False, "notes": []}
+    assert [f["file_path"] for f in transforms["frames"]] == ["5.png", "6.png", "7.png"]
+    for found, wanted in zip(transforms["frames"], seen(addon, filmed, camera), strict=True):
         np.testing.assert_allclose(found["transform_matrix"], wanted.pose, atol=2e-5)
-        np.testing.assert_allclose([told[n] for n in ("fl_x", "fl_y", "cx", "cy")], wanted.K, atol=2e-5)
+        np.testing.assert_allclose([transforms[n] for n in ("fl_x", "fl_y", "cx", "cy")], wanted.K, atol=2e-5)
 
 
 @pytest.fixture
@@ -106,15 +106,15 @@ def test_of_several_cameras_the_first_that_moves_is_taken_and_said(filmed, readi
     animated(filmed, "b")
     animated(filmed, "a", end=0.0)
     animated(filmed, "c")
-    told = reading()
-    assert told["splannequin"]["notes"][0][0] == "set.abc contains 3 cameras. b was used, the first that moves."
+    message = reading()
+    assert message["splannequin"]["notes"][0][0] == "set.abc contains 3 cameras. b was used, the first that moves."
 
 
 def test_a_film_back_of_another_shape_is_said_and_its_width_is_the_frames(filmed, reading):
     animated(filmed, "wide", film=(36.0, 20.25))
-    told = reading()
-    assert told["fl_x"] == pytest.approx(28.0 / 36.0 * 16) and told["fl_y"] == pytest.approx(told["fl_x"])
-    assert "is 36 x 20.25 mm, another shape" in told["splannequin"]["notes"][0][0]
+    message = reading()
+    assert message["fl_x"] == pytest.approx(28.0 / 36.0 * 16) and message["fl_y"] == pytest.approx(message["fl_x"])
+    assert "is 36 x 20.25 mm, another shape" in message["splannequin"]["notes"][0][0]
 
 
 def test_a_file_without_a_camera_that_moves_is_refused(contract, filmed, reading):
@@ -139,7 +139,7 @@ def test_what_is_no_such_file_is_refused_in_a_sentence(addon, contract, filmed, 
         addon("process.steps").STEPS["solve"].params(filmed)
 
 
-def test_the_timer_waits_for_the_other_blender_and_ends_it_when_given_up(addon, filmed, shot, tmp_path):
+def test_timer_waits_for_the_second_blender_and_kills_it_on_cancel(addon, filmed, shot, tmp_path):
     animated(filmed, "match")
     file = tmp_path / "set.fbx"
     export(file)

@@ -29,7 +29,7 @@ def test_identity_camera_looks_along_z_with_y_down(addon):
     np.testing.assert_allclose(matrix @ [1, 0, 0, 0], [1, 0, 0, 0])
 
 
-def test_translation_moves_the_camera_the_other_way(addon):
+def test_root_translation_is_inverted_for_the_camera(addon):
     viewmat = np.eye(4)
     viewmat[:3, 3] = (1, 2, 3)
     np.testing.assert_allclose(addon("scene.axes").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
@@ -70,8 +70,8 @@ def test_points_fall_where_the_solve_says(addon, scene, shot, fy):
         scene.frame_set(pose["frame"])
         expected = project(np.reshape(pose["viewmat"], (4, 4)), pose["K"], points)
         for point, (u, v) in zip(points, expected, strict=True):
-            there = root.matrix_world @ Vector(point)
-            x, y, _ = world_to_camera_view(scene, scene.camera, there)
+            projected = root.matrix_world @ Vector(point)
+            x, y, _ = world_to_camera_view(scene, scene.camera, projected)
             assert (x * width, (1 - y) * height) == pytest.approx((u, v), abs=2e-3)
 
 
@@ -129,7 +129,7 @@ def test_plate_fits_the_sensor_and_follows_the_frame_numbers(addon, scene, shot)
     assert (user.frame_start, user.frame_offset, user.frame_duration) == (5, 4, 3)
 
 
-def test_points_keep_their_colours(addon, scene, shot):
+def test_point_cloud_has_stored_colours_and_positions(addon, scene, shot):
     addon("solve.cameras").build(scene, shot)
     cloud = addon("solve.cameras").find(scene, shot, "MESH")
     stored = np.load(shot / "solve" / "points.npz")
@@ -204,8 +204,8 @@ def test_what_the_artist_set_in_the_camera_stays_over_the_next_solve(addon, scen
     data.dof.keyframe_insert("focus_distance", frame=5)
     camera.keyframe_insert("hide_render", frame=5)
     camera.name = "hero"
-    own = data.background_images.new()
-    own.image = bpy.data.images.new("storyboard", 8, 8)
+    artists_image = data.background_images.new()
+    artists_image.image = bpy.data.images.new("storyboard", 8, 8)
     data.background_images[0].alpha = 0.25
     rewrite(shot, K=[30.0, 30.0, 9.0, 5.0])
     cameras.build(scene, shot)
@@ -296,11 +296,11 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     addon("solve.arrival").load_camera(scene, shot)
     root = cameras.find(scene, shot, "EMPTY")
     root.scale = (2.0, 2.0, 2.0)
-    own = bpy.data.objects.new("mine", scene.camera.data.copy())
-    scene.collection.objects.link(own)
+    artists_camera = bpy.data.objects.new("mine", scene.camera.data.copy())
+    scene.collection.objects.link(artists_camera)
     for kind in ("COPY_LOCATION", "COPY_ROTATION"):
-        own.constraints.new(kind).target = scene.camera
-    scene.splannequin.path_camera = own
+        artists_camera.constraints.new(kind).target = scene.camera
+    scene.splannequin.path_camera = artists_camera
     assert addon("freeze.own_camera").name_of(scene) == "mine"
     scene.frame_start, scene.frame_end, scene.frame_step = 5, 7, 1
     scene.frame_set(6)
@@ -312,14 +312,14 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
         assert (found.frame, found.source) == (solved.frame, "blender")
         np.testing.assert_allclose(found.viewmat, solved.viewmat, atol=5e-5)
         np.testing.assert_allclose(found.K, solved.K, rtol=1e-4)
-    own.data.lens *= 2.0
+    artists_camera.data.lens *= 2.0
     wide = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 64))
     assert (wide.width, wide.height) == (64, 48)
     np.testing.assert_allclose(wide.frames[0].K[0], 8 * want.frames[0].K[0], rtol=1e-4)
     params = addon("freeze.takes").freeze_from(scene, wide)
     assert contract.CameraPath.load(params.camera_path) == wide
     assert params.width == 64
-    own.data.type = "ORTHO"
+    artists_camera.data.type = "ORTHO"
     with pytest.raises(contract.JobError, match="mine is not a perspective camera"):
         run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
     scene.splannequin.path_camera = scene.camera
@@ -330,23 +330,23 @@ def test_motion_blur_takes_the_scenes_shutter_and_only_on_a_camera_of_the_artist
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
     addon("solve.arrival").load_camera(scene, shot)
-    own = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
-    scene.collection.objects.link(own)
+    artists_camera = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    scene.collection.objects.link(artists_camera)
     takes, props = addon("freeze.takes"), scene.splannequin
-    props.path_camera, scene.render.motion_blur_shutter = own, 0.25
+    props.path_camera, scene.render.motion_blur_shutter = artists_camera, 0.25
     assert takes.params_of(scene).shutter == 0.0, "unless it is asked for"
     props.motion_blur = True
     scene.frame_start, scene.frame_end = 5, 7
     path = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
-    asked = takes.freeze_from(scene, path)
-    assert asked.shutter == pytest.approx(90.0)
-    contract.check_params(asked)
+    params = takes.freeze_from(scene, path)
+    assert params.shutter == pytest.approx(90.0)
+    contract.check_params(params)
     scene.render.motion_blur_shutter = 3.0
     contract.check_params(takes.params_of(scene))
     assert takes.params_of(scene).shutter == 360.0
     file = shot / "takes" / "freeze" / "take.json"
-    told = json.loads(file.read_text()) | {"camera_path": asked.camera_path, "shutter": 360.0}
-    file.write_text(json.dumps(told))
+    facts = json.loads(file.read_text()) | {"camera_path": params.camera_path, "shutter": 360.0}
+    file.write_text(json.dumps(facts))
     assert takes.take_params(shot, "freeze").shutter == 360.0
     take = addon("shot.inventory").read(shot).takes["freeze"]
     props.run_name = take["run"]
@@ -379,15 +379,15 @@ def test_a_camera_moves_in_a_scene_that_is_not_shown(addon, moving, shot):
     """A camera that is shared with the window's scene is read from its own scene's evaluation."""
     wanted = path_of(addon, moving, shot)
     assert len(set(wanted)) == 5
-    other = bpy.data.scenes.new("B")
-    other.collection.objects.link(moving.objects["Camera"])
-    other.splannequin.shot_path, other.frame_end = str(shot), 5
-    assert bpy.context.scene == moving and path_of(addon, other, shot) == wanted
+    second_scene = bpy.data.scenes.new("B")
+    second_scene.collection.objects.link(moving.objects["Camera"])
+    second_scene.splannequin.shot_path, second_scene.frame_end = str(shot), 5
+    assert bpy.context.scene == moving and path_of(addon, second_scene, shot) == wanted
     root = bpy.data.objects.new("root", None)
-    other.collection.objects.link(root)
+    second_scene.collection.objects.link(root)
     root.scale = (2.0, 2.0, 2.0)
-    addon("shot.scene_objects").new(other, shot).root = root
-    assert path_of(addon, other, shot) == pytest.approx([value / 2 for value in wanted], abs=1e-3)
+    addon("shot.scene_objects").new(second_scene, shot).root = root
+    assert path_of(addon, second_scene, shot) == pytest.approx([value / 2 for value in wanted], abs=1e-3)
 
 
 @pytest.mark.parametrize("how", ["disabled", "excluded"])
@@ -425,7 +425,7 @@ def test_reading_a_camera_can_be_cancelled(read_on, moving, shot):
     assert not read_on.failures and not (shot / "jobs").exists()
 
 
-def test_reading_a_camera_ends_with_its_file_and_leaves_the_next_one_alone(read_on):
+def test_reading_a_camera_stops_when_the_file_closes(read_on):
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     assert read_on.work is None and bpy.context.scene.name == "Scene"
     assert bpy.context.scene.frame_current == 1
@@ -478,7 +478,7 @@ def test_a_keyed_instant_is_followed_frame_by_frame(addon, scene, shot):
     assert steps.STEPS["freeze"].params(scene).t_star_per_frame == {}
 
 
-def test_points_keep_their_own_colours(addon, scene, shot):
+def test_points_are_drawn_with_their_colours(addon, scene, shot):
     """Points are drawn over the view with colours. Blender draws loose points black, so the object shows only its
     bounds."""
     cameras = addon("solve.cameras")

@@ -20,8 +20,8 @@ def solved(addon, scene, shot):
 
 
 @pytest.fixture
-def own(addon, contract, solved, shot, new_take):
-    """own(): adds a take "mine" seen by a separate artist's camera; returns that camera."""
+def artists_take(addon, contract, solved, shot, new_take):
+    """artists_take(): adds a take "mine" seen by a separate artist's camera; returns that camera."""
 
     def make() -> bpy.types.Object:
         camera = bpy.data.objects.new("Mine", bpy.data.cameras.new("Mine"))
@@ -49,7 +49,7 @@ def bake(addon, scene, folder: Path) -> list[int]:
     return addon("bake.rendering").render(scene, folder, check=addon("bake.cg_camera").check)
 
 
-def test_the_clips_own_camera_is_right(addon, solved, shot, tmp_path):
+def test_clip_camera_is_accepted_for_cg(addon, solved, shot, tmp_path):
     before = solved.camera
     assert addon("bake.insertion").combine_cg(solved, shot)
     assert solved.camera == before
@@ -74,9 +74,9 @@ def shifted(camera) -> None:
 
 
 def marked(scene) -> None:
-    other = bpy.data.objects.new("Other", bpy.data.cameras.new("Other"))
-    scene.collection.objects.link(other)
-    scene.timeline_markers.new("cut", frame=7).camera = other
+    second_camera = bpy.data.objects.new("Other", bpy.data.cameras.new("Other"))
+    scene.collection.objects.link(second_camera)
+    scene.timeline_markers.new("cut", frame=7).camera = second_camera
 
 
 def unparented(camera) -> None:
@@ -108,8 +108,8 @@ def test_the_size_in_percent_does_not_matter(addon, solved, shot, tmp_path, perc
     assert bake(addon, solved, tmp_path / "out") == [5, 6, 7]
 
 
-def test_a_take_of_the_artists_camera_is_combined_through_it(addon, contract, solved, shot, own, tmp_path):
-    camera, clips = own(), solved.camera
+def test_a_take_of_the_artists_camera_is_combined_through_it(addon, contract, solved, shot, artists_take, tmp_path):
+    camera, clips = artists_take(), solved.camera
     addon("bake.insertion").insert_freeze(solved, shot, "mine")
     said = addon("bake.insertion").combine_cg(solved, shot)
     assert solved.camera == camera and any(line.startswith("Mine is now the scene's camera") for line in said)
@@ -120,11 +120,11 @@ def test_a_take_of_the_artists_camera_is_combined_through_it(addon, contract, so
     assert "Make Mine the scene's camera" in failure.value.hint
 
 
-def test_another_take_beside_cg_is_said_when_it_is_inserted_and_refused_when_it_is_baked(
-    addon, contract, solved, shot, own, tmp_path
+def test_second_take_with_cg_warns_on_insert_and_is_refused_on_bake(
+    addon, contract, solved, shot, artists_take, tmp_path
 ):
     addon("bake.insertion").combine_cg(solved, shot)
-    own()
+    artists_take()
     said = addon("bake.insertion").insert_freeze(solved, shot, "mine")
     assert any(line.startswith("CG would slide") for line in said)
     with pytest.raises(contract.JobError, match="CG would slide"):
@@ -133,8 +133,8 @@ def test_another_take_beside_cg_is_said_when_it_is_inserted_and_refused_when_it_
     assert bake(addon, solved, tmp_path / "out") == [5, 6, 7]
 
 
-def test_no_camera_that_fits_is_said_and_nothing_is_changed(addon, contract, solved, shot, own):
-    camera = own()
+def test_no_camera_that_fits_is_said_and_nothing_is_changed(addon, contract, solved, shot, artists_take):
+    camera = artists_take()
     addon("bake.insertion").insert_freeze(solved, shot, "mine")
     bpy.data.objects.remove(camera)
     nodes = len(addon("compat").compositor_tree(solved).nodes)
@@ -162,7 +162,7 @@ def shown(addon, scene) -> str:
 
 
 @pytest.mark.parametrize("kind", ["FULL_COPY", "LINK_COPY"])
-def test_a_take_baked_in_a_copy_of_a_scene_leaves_the_other_scenes(addon, solved, shot, new_take, kind):
+def test_bake_in_a_copied_scene_does_not_change_the_original(addon, solved, shot, new_take, kind):
     new_take(shot, "second")
     addon("bake.insertion").combine_cg(solved, shot)
     bpy.ops.scene.new(type=kind)
@@ -186,11 +186,11 @@ def test_a_group_copied_by_hand_stays_as_it_is(addon, solved, shot, new_take):
     new_take(shot, "second")
     compat = addon("compat")
     node = addon("bake.freeze_group").group_node(compat.compositor_tree(solved))
-    other = bpy.data.scenes.new("other")
-    tree = compat.new_compositor_tree(other, "theirs")
+    second_scene = bpy.data.scenes.new("other")
+    tree = compat.new_compositor_tree(second_scene, "theirs")
     tree.nodes.new("CompositorNodeGroup").node_tree = node.node_tree
     addon("bake.insertion").insert_freeze(solved, shot, "second")
-    assert (shown(addon, solved), shown(addon, other)) == ("second", "freeze")
+    assert (shown(addon, solved), shown(addon, second_scene)) == ("second", "freeze")
 
 
 def test_a_tree_that_scenes_share_is_copied_only_when_it_is_changed(addon, contract, solved, shot, new_take):
@@ -198,11 +198,11 @@ def test_a_tree_that_scenes_share_is_copied_only_when_it_is_changed(addon, contr
     if not compat.HAS_COMPOSITING_GROUP:
         pytest.skip("until 5.0 a compositor is the scene's own")
     new_take(shot, "second")
-    other, tree = bpy.data.scenes.new("other"), solved.compositing_node_group
-    other.compositing_node_group = tree
+    second_scene, tree = bpy.data.scenes.new("other"), solved.compositing_node_group
+    second_scene.compositing_node_group = tree
     with pytest.raises(contract.JobError):
-        addon("bake.insertion").insert_freeze(other, shot, "no such take")
-    assert other.compositing_node_group == solved.compositing_node_group == tree
-    addon("bake.insertion").insert_freeze(other, shot, "second")
-    assert (shown(addon, solved), shown(addon, other)) == ("freeze", "second")
+        addon("bake.insertion").insert_freeze(second_scene, shot, "no such take")
+    assert second_scene.compositing_node_group == solved.compositing_node_group == tree
+    addon("bake.insertion").insert_freeze(second_scene, shot, "second")
+    assert (shown(addon, solved), shown(addon, second_scene)) == ("freeze", "second")
     assert solved.compositing_node_group == tree

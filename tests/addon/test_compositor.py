@@ -72,12 +72,12 @@ def test_second_bake_updates_the_group(addon, scene, artists_tree, take, shot, n
     group.inputs["Mix"].default_value = 0.25
     before = snapshot(artists_tree)
     counts = len(bpy.data.node_groups), len(bpy.data.images)
-    other = addon("bake.take_files").take_of(new_take(shot, "second"), depth_scale=3.0)
-    said = compositor.insert(scene, other)
+    second_take = addon("bake.take_files").take_of(new_take(shot, "second"), depth_scale=3.0)
+    said = compositor.insert(scene, second_take)
     assert snapshot(artists_tree) == before, "Mix and every link around the group stay"
     assert (len(bpy.data.node_groups), len(bpy.data.images)) == counts
     frozen = addon("bake.freeze_group").group_node(artists_tree).node_tree.nodes["Frozen"]
-    assert Path(bpy.path.abspath(frozen.image.filepath)).parent == other.folder
+    assert Path(bpy.path.abspath(frozen.image.filepath)).parent == second_take.folder
     assert (
         addon("bake.freeze_group")
         .group_node(artists_tree)
@@ -121,7 +121,7 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
     assert not bpy.data.node_groups and not [i for i in bpy.data.images if i.source == "SEQUENCE"]
 
 
-def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, shot):
+def test_prefetched_pictures_are_used_on_arrival(addon, scene, artists_tree, shot):
     bake = addon("bake.insertion")
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
     assert len(list(bake.prefetch(scene, shot, "freeze"))) == 1, "the artist's tree shows no plate of ours"
@@ -132,7 +132,7 @@ def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, 
     assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
 
 
-def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, shot, tmp_path, pictures):
+def test_prefetched_pictures_are_read_again_for_the_next_bake(addon, scene, shot, tmp_path, pictures):
     bake, plate = addon("bake.insertion"), shot / "frames" / "000005.png"
     for value in (40, 200):  # stands for a first bake that ended before insertion
         pictures.write(plate, np.full((12, 16, 3), value, np.uint8))
@@ -146,7 +146,7 @@ def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, s
     assert np.abs(pictures.read(tmp_path / "out" / "000005.png") * 255 - 200).max() < 0.6
 
 
-def test_compositor_that_was_off_is_said_and_put_back(addon, scene, artists_tree, take):
+def test_enabling_the_compositor_is_reported_and_undone(addon, scene, artists_tree, take):
     compat = addon("compat")
     switches = {name: False for name in compat.compositor_switches(scene)}
     compat.restore_compositor_switches(scene, switches)
@@ -161,12 +161,12 @@ def test_removal_leaves_a_group_that_another_scene_shows(addon, scene, artists_t
     compat, compositor = addon("compat"), addon("bake.compositor")
     compositor.insert(scene, take)
     group = addon("bake.freeze_group").group_node(compat.compositor_tree(scene)).node_tree
-    other = bpy.data.scenes.new("other")
-    compat.new_compositor_tree(other, "other").nodes.new("CompositorNodeGroup").node_tree = group
+    second_scene = bpy.data.scenes.new("other")
+    compat.new_compositor_tree(second_scene, "other").nodes.new("CompositorNodeGroup").node_tree = group
     assert compositor.remove(scene)
-    shown = addon("bake.freeze_group").group_node(compat.compositor_tree(other))
+    shown = addon("bake.freeze_group").group_node(compat.compositor_tree(second_scene))
     assert shown is not None and "Frozen" in shown.node_tree.nodes and shown.node_tree.nodes["Frozen"].image
-    assert compositor.remove(other) and not any(g.get("splannequin") for g in bpy.data.node_groups)
+    assert compositor.remove(second_scene) and not any(g.get("splannequin") for g in bpy.data.node_groups)
 
 
 def test_group_offers_what_a_compositor_needs(addon, scene, take, contract):
@@ -354,10 +354,10 @@ def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene,
     tree, plate = graded(tmp_path / "a 0005.png")
     before, bake, props = snapshot(tree), addon("bake.insertion"), scene.splannequin
     output = addon("compat").output_socket(tree)
-    other = tree.nodes.new("CompositorNodeImage")
+    image_node = tree.nodes.new("CompositorNodeImage")
     over = tree.nodes.new("CompositorNodeAlphaOver")
-    tree.links.new(other.outputs["Image"], over.inputs[2])
-    with_other = snapshot(tree)
+    tree.links.new(image_node.outputs["Image"], over.inputs[2])
+    with_image_node = snapshot(tree)
     tree.nodes.active = None
     props.insert_at = "PLATE"
     bake.insert(scene, shot, "freeze")
@@ -369,8 +369,8 @@ def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene,
     assert output.links[0].from_node == node and node.inputs["Mix"].default_value == 0.25
     assert not [link for link in plate.outputs["Image"].links if link.to_node == node]
     bake.remove(scene)
-    assert snapshot(tree) == with_other
-    tree.nodes.remove(other)
+    assert snapshot(tree) == with_image_node
+    tree.nodes.remove(image_node)
     tree.nodes.remove(over)
     assert snapshot(tree) == before
     tree.nodes.remove(plate)
@@ -465,13 +465,13 @@ def test_only_moving_leaves_cg_where_nothing_moves(addon, scene, take, shot, tmp
     linear = light_of(plate)
     nearer = in_front(12.0, data["depth"])
     frozen = nearer * green + (1.0 - nearer) * over(data["rgba"], np.broadcast_to(green, data["rgba"].shape))
-    own = nearer * green[:3] + (1.0 - nearer) * linear
+    mixed = nearer * green[:3] + (1.0 - nearer) * linear
     for name, share in (("Only Moving", data["motion"]), ("Only Supported", data["support"]), ("Mix", 0.0)):
         before = node.inputs[name].default_value
         node.inputs[name].default_value = 0.0 if name == "Mix" else 1.0
         render(addon, scene, tmp_path / name)
         node.inputs[name].default_value = before
-        expected = own + np.broadcast_to(share, (12, 16))[..., None] * (frozen[..., :3] - own)
+        expected = mixed + np.broadcast_to(share, (12, 16))[..., None] * (frozen[..., :3] - mixed)
         found = pictures.read(tmp_path / name / "000006.png")
         assert np.abs(found - pictures.srgb(expected)).max() * 255 < 1.1, name
 
@@ -531,7 +531,7 @@ def test_cg_softness_0_changes_no_bit(addon, scene, take, tmp_path):
             node.inputs["CG Depth"].default_value = depth
             yield float_picture(scene, tmp_path, size=(16, 12))
 
-    off, soft = np.stack([*shown(0.0)]), np.stack([*shown(0.25)])
+    hard_edge, soft = np.stack([*shown(0.0)]), np.stack([*shown(0.25)])
     (smooth,) = (n for n in node.node_tree.nodes if n.label == "CG is nearer")
     slope = smooth.inputs[1].links[0].from_node
     eased = slope.inputs[0].links[0].from_node
@@ -540,8 +540,8 @@ def test_cg_softness_0_changes_no_bit(addon, scene, take, tmp_path):
     node.node_tree.links.remove(eased.inputs[1].links[0])
     eased.inputs[1].default_value = 1.0
     hard = np.stack([*shown(0.25)])
-    assert np.array_equal(off, hard) and not np.array_equal(soft, hard)
-    assert len(np.unique((off - off[0])[1:, :, 1:, 0])) > 5, "pixels that CG is half behind are among them"
+    assert np.array_equal(hard_edge, hard) and not np.array_equal(soft, hard)
+    assert len(np.unique((hard_edge - hard_edge[0])[1:, :, 1:, 0])) > 5, "pixels that CG is half behind are among them"
 
 
 def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_path, layers, pictures):
@@ -572,8 +572,8 @@ def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_pat
 def with_a_wall(addon, scene, tmp_path, pictures, place: tuple[float, float, float], samples: int) -> np.ndarray:
     """Render frame 6 with a green wall of 400 x 400 facing the camera, centred at `place` in camera space."""
     scene.frame_set(6)
-    for other in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
-        bpy.data.objects.remove(other)
+    for mesh in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
+        bpy.data.objects.remove(mesh)
     scene.render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.device = samples, False, "CPU"
     scene.cycles.use_adaptive_sampling = False

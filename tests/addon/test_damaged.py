@@ -27,10 +27,10 @@ def full_shot(addon, contract, shot) -> Path:
         folder = jobs.new_job(shot, kind, cls()).folder
         status = {"kind": kind, "state": "done", "pid": 1, "started": 1.0, "process_started": 2.0, "heartbeat": 2.0}
         (folder / "status.json").write_text(json.dumps({**status, "stage": "s", "fraction": 0.5, "host": "elsewhere"}))
-        told = [("warning", {"message": "m", "hint": "h"}), ("image", {"label": "preview", "path": "p.png"})]
-        told += [("metric", {"stage": "s", "values": {"seconds": 1, "heldout_psnr_db": 2}})]
-        told += [("done", {"state": "done", "result": {"t_star_frame": 6, "take": "freeze", "first": 5, "last": 7}})]
-        lines = [{"type": t, "seq": n, "time": 1.0, "data": d, "version": 1} for n, (t, d) in enumerate(told)]
+        events = [("warning", {"message": "m", "hint": "h"}), ("image", {"label": "preview", "path": "p.png"})]
+        events += [("metric", {"stage": "s", "values": {"seconds": 1, "heldout_psnr_db": 2}})]
+        events += [("done", {"state": "done", "result": {"t_star_frame": 6, "take": "freeze", "first": 5, "last": 7}})]
+        lines = [{"type": t, "seq": n, "time": 1.0, "data": d, "version": 1} for n, (t, d) in enumerate(events)]
         (folder / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         (folder / "log.txt").write_text("a line\n")
         (folder / "step").write_text("footage")
@@ -64,7 +64,7 @@ def look(addon, scene):
             texts += [*shown.state, shown.advice, name]
         for row in listing.run_rows(watch.state) + listing.take_rows(watch.state):
             texts += row
-        texts += [told for damaged in watch.state.damaged.values() for told in damaged.values()]
+        texts += [reason for damaged in watch.state.damaged.values() for reason in damaged.values()]
         addon("train.training").plan(watch.state, "main", "preview")
         for run in watch.state.runs.values():
             if len(run["history"]) > 1:
@@ -91,20 +91,20 @@ def test_a_whole_shot_is_not_damaged(look, full_shot, addon):
     assert state.listed("run") == ["main"] and state.listed("take") == ["freeze"] and len(state.runs["main"]["history"])
 
 
-def mutated(told: object, random_: random.Random) -> object:
+def mutated(value: object, random_: random.Random) -> object:
     """Copy of a JSON value with one part changed or removed."""
-    told = copy.deepcopy(told)
-    if not isinstance(told, (dict, list)) or not told or random_.random() < 0.15:
+    value = copy.deepcopy(value)
+    if not isinstance(value, (dict, list)) or not value or random_.random() < 0.15:
         return random_.choice(WEIRD)
-    key = random_.choice(list(told) if isinstance(told, dict) else range(len(told)))
+    key = random_.choice(list(value) if isinstance(value, dict) else range(len(value)))
     if random_.random() < 0.2:
-        del told[key]
+        del value[key]
     else:
-        told[key] = mutated(told[key], random_)
-    return told
+        value[key] = mutated(value[key], random_)
+    return value
 
 
-def test_files_with_anything_in_them_are_passed_over_or_told(look, full_shot):
+def test_damaged_files_are_skipped_or_reported(look, full_shot):
     random_ = random.Random(13)  # noqa: S311
     files = [f for f in files_of(full_shot) if f.suffix in (".json", ".jsonl")]
     for n in range(400):
@@ -160,8 +160,8 @@ def test_files_that_are_none_hold_nothing_up(look, full_shot, what, tmp_path):
 def test_a_damaged_run_and_take_are_shown_as_such(look, full_shot, addon):
     shots, listing = addon("shot.inventory"), addon("ui.listing")
     for file in (RUN, TAKE):
-        told = json.loads((full_shot / file).read_text())
-        (full_shot / file).write_text(json.dumps({**told, "run": ["main"]}))
+        content = json.loads((full_shot / file).read_text())
+        (full_shot / file).write_text(json.dumps({**content, "run": ["main"]}))
     state = shots.read(full_shot)
     assert state.runs == {} and state.takes == {}
     assert listing.run_rows(state) == [("main", "damaged")] and listing.take_rows(state) == [("freeze", "damaged")]

@@ -33,12 +33,12 @@ def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(
     run_out(environment, setup)
     assert "failed at installing packages" in setup.failure, setup.output
     assert str(folder) in setup.failure
-    made = (folder / ".venv" / "pyvenv.cfg").stat().st_mtime
+    created = (folder / ".venv" / "pyvenv.cfg").stat().st_mtime
     again = environment.start(folder, sys.executable, root)
     run_out(environment, again)
     assert "failed at installing packages" in again.failure
     assert not trap.exists(), trap.read_text()
-    assert (folder / ".venv" / "pyvenv.cfg").stat().st_mtime == made, "the retry went on in the same environment"
+    assert (folder / ".venv" / "pyvenv.cfg").stat().st_mtime == created, "the retry went on in the same environment"
     assert environment.remove(folder)
     assert not (folder / ".venv").exists()
     assert not environment.remove(folder)
@@ -66,7 +66,7 @@ def test_what_is_not_ours_is_not_removed(addon, tmp_path):
 
 
 @pytest.fixture
-def made(addon, tmp_path, monkeypatch):
+def existing_environment(addon, tmp_path, monkeypatch):
     """Folder with an environment of ours, at the place where Set Up Backend would create it."""
     folder = tmp_path / "backend"
     (folder / ".venv" / ".splannequin").mkdir(parents=True)
@@ -75,11 +75,11 @@ def made(addon, tmp_path, monkeypatch):
     return folder
 
 
-def test_removal_does_not_wait_for_the_files(addon, made):
+def test_removal_does_not_wait_for_the_files(addon, existing_environment):
     """Deletion of gigabytes runs in a thread, so that Blender stays responsive. Remains of earlier removals are deleted
     too."""
     environment = addon("process.environment")
-    (made / ".venv-removed-before").mkdir()
+    (existing_environment / ".venv-removed-before").mkdir()
     deleted_by: set[str] = set()
 
     def note(frame, event, _) -> None:
@@ -88,26 +88,26 @@ def test_removal_does_not_wait_for_the_files(addon, made):
 
     threading.setprofile(note)
     try:
-        assert environment.remove(made)
+        assert environment.remove(existing_environment)
     finally:
         threading.setprofile(None)
-    assert not (made / ".venv").exists()
+    assert not (existing_environment / ".venv").exists()
     for thread in threading.enumerate():
         if thread.name == "removed backend":
             thread.join(60.0)
-    assert deleted_by == {"removed backend"} and not list(made.iterdir())
+    assert deleted_by == {"removed backend"} and not list(existing_environment.iterdir())
 
 
-def test_what_a_job_works_with_is_not_removed(addon, contract, made, shot):
+def test_what_a_job_works_with_is_not_removed(addon, contract, existing_environment, shot):
     supervisor, jobs = addon("process.job_timer"), addon("process.jobs")
     job = jobs.new_job(shot, "train", contract.TrainParams())
     supervisor.follow("train", job)
     with pytest.raises(RuntimeError, match=f"a step of {shot.name} is running"):
         bpy.ops.splannequin.remove_backend()
-    assert (made / ".venv" / "package.py").exists()
+    assert (existing_environment / ".venv" / "package.py").exists()
     job.status = contract.Status("train", "done", 0, 0.0, 1.0, 0.0)
     assert bpy.ops.splannequin.remove_backend() == {"FINISHED"}
-    assert not list(made.iterdir()), "headless, it is gone when the button says so"
+    assert not list(existing_environment.iterdir()), "headless, it is gone when the button says so"
 
 
 def at_work(folder) -> subprocess.Popen[bytes]:
@@ -126,37 +126,39 @@ def at_work(folder) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
-def test_what_a_process_of_others_works_with_is_not_removed(addon, made):
+def test_environment_in_use_by_another_process_is_not_removed(addon, existing_environment):
     """A job of another Blender or of a command line is unknown to this Blender."""
-    with at_work(made) as other:
+    with at_work(existing_environment) as process:
         try:
-            with pytest.raises(RuntimeError, match=rf"not removed, because another Blender.*\(process {other.pid}\)"):
+            with pytest.raises(RuntimeError, match=rf"not removed, because another Blender.*\(process {process.pid}\)"):
                 bpy.ops.splannequin.remove_backend()
-            assert other.poll() is None and (made / ".venv" / "package.py").exists()
+            assert process.poll() is None and (existing_environment / ".venv" / "package.py").exists()
         finally:
-            other.kill()
-    assert bpy.ops.splannequin.remove_backend() == {"FINISHED"} and not list(made.iterdir())
+            process.kill()
+    assert bpy.ops.splannequin.remove_backend() == {"FINISHED"} and not list(existing_environment.iterdir())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
-def test_what_a_process_begins_with_while_it_is_being_removed_is_put_back(addon, made, monkeypatch):
+def test_what_a_process_begins_with_while_it_is_being_removed_is_put_back(addon, existing_environment, monkeypatch):
     environment, begun, replace = addon("process.environment"), [], os.replace
 
     def after_somebody_began(source, target):
         if not begun:
-            begun.append(at_work(made))
+            begun.append(at_work(existing_environment))
         replace(source, target)
 
     monkeypatch.setattr(environment.os, "replace", after_somebody_began)
     try:
         with pytest.raises(environment.AtWork, match="runs in it"):
-            environment.remove(made)
-        assert [path.name for path in made.iterdir()] == [".venv"] and (made / ".venv" / "package.py").exists()
+            environment.remove(existing_environment)
+        assert [path.name for path in existing_environment.iterdir()] == [".venv"] and (
+            existing_environment / ".venv" / "package.py"
+        ).exists()
     finally:
         for process in begun:
             with process:
                 process.kill()
-    assert environment.remove(made, wait=True) and not list(made.iterdir())
+    assert environment.remove(existing_environment, wait=True) and not list(existing_environment.iterdir())
 
 
 @pytest.fixture
@@ -175,7 +177,7 @@ def system(addon, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(bpy.app.online_access_override, reason="this Blender was started online or offline for good")
-def test_offline_the_button_says_so_and_goes_online_only_when_it_is_told_to(system, tmp_path):
+def test_offline_button_asks_before_going_online(system, tmp_path):
     assert bpy.ops.splannequin.set_up.poll(), "a grey button offers nothing"
     with pytest.raises(RuntimeError, match="online access is turned off"):
         bpy.ops.splannequin.set_up()

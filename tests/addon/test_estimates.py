@@ -13,7 +13,7 @@ def test_a_tooltip_tells_what_the_preset_is(addon, contract):
 
 
 @pytest.mark.parametrize("by_hand", [False, True])
-def test_the_scale_is_asked_for_until_it_was_set(addon, scene, shot, by_hand):
+def test_shot_is_unscaled_until_the_scale_is_set(addon, scene, shot, by_hand):
     scene.splannequin.shot_path = str(shot)
     bpy.ops.splannequin.load_camera()
     scaled = addon("solve.scale").scaled

@@ -23,13 +23,13 @@ def absolute(path: str) -> Path:
 
 
 def test_the_example_shows_its_pictures_from_another_place(example, addon, shot, tmp_path, layers, pictures):
-    made = tmp_path / "made é"
-    made.mkdir()
-    shutil.move(str(shot), made / "shot.splannequin")
-    (made / "blends").mkdir()
-    example.make(made / "shot.splannequin", "freeze", made / "blends" / "x.blend")
-    assert [p.name for p in (made / "blends").iterdir()] == ["x.blend"]
-    moved = made.rename(tmp_path / "elsewhere")
+    copy = tmp_path / "made é"
+    copy.mkdir()
+    shutil.move(str(shot), copy / "shot.splannequin")
+    (copy / "blends").mkdir()
+    example.make(copy / "shot.splannequin", "freeze", copy / "blends" / "x.blend")
+    assert [p.name for p in (copy / "blends").iterdir()] == ["x.blend"]
+    moved = copy.rename(tmp_path / "elsewhere")
 
     bpy.ops.wm.open_mainfile(filepath=str(moved / "blends" / "x.blend"))
     scene = bpy.context.scene

@@ -11,10 +11,12 @@ import pytest
 @pytest.fixture
 def imported(shot, contract):
     """Shot with the record that an import writes."""
-    there = contract.ShotFolder(shot)
+    shot_folder = contract.ShotFolder(shot)
     frames = [{"frame": n, "file": f"raw/{n:06d}.png"} for n in range(5, 8)]
-    record = json.loads(there.listing.read_text()) if there.listing.is_file() else {"width": 64, "height": 36}
-    contract.write_json(there.listing, {**record, "frames": record.get("frames") or frames})
+    record = (
+        json.loads(shot_folder.listing.read_text()) if shot_folder.listing.is_file() else {"width": 64, "height": 36}
+    )
+    contract.write_json(shot_folder.listing, {**record, "frames": record.get("frames") or frames})
     return shot
 
 
@@ -36,13 +38,13 @@ def test_the_button_writes_a_job_with_what_the_artist_set(scene, imported, tmp_p
     assert bpy.ops.splannequin.export_for_farm(directory=str(out), frames=2, bake=True) == {"FINISHED"}
     template = json.loads((out / "template.json").read_text())
     assert kinds(template)[-5:] == ["open", "freeze", "finish", "bake", "deliver"]
-    asked = request_of(template, "freeze")
-    assert asked["takes"] == {"6": "hero"} and asked["freeze"]["only_missing"]
+    request = request_of(template, "freeze")
+    assert request["takes"] == {"6": "hero"} and request["freeze"]["only_missing"]
     (places,) = {str(one["parameterSpace"]["taskParameterDefinitions"][0]["range"]) for one in template["steps"]}
     assert places == str([str(imported)])
 
 
-def test_the_button_is_on_once_there_is_something_to_export(scene, shot):
+def test_export_button_is_enabled_once_something_can_be_exported(scene, shot):
     """Also in a script, where no timer reads the folder."""
     scene.splannequin.shot_path = str(shot)
     (shot / "shot.json").rename(shot / "away")
@@ -59,7 +61,7 @@ def test_the_button_says_what_is_wrong(scene, imported, tmp_path, contract):
         bpy.ops.splannequin.export_for_farm()
 
 
-def test_the_verb_writes_what_the_backends_own_does(run, imported, tmp_path, addon):
+def test_addon_verb_writes_the_same_files_as_the_backend(run, imported, tmp_path, addon):
     out = tmp_path / "job"
     words = ["--t-star", "5,7", "--frames", "2", "--freeze-width", "48", "--device", "cpu"]
     code, said, err = run("farm", "export", imported, "--output", out, *words)
@@ -67,10 +69,10 @@ def test_the_verb_writes_what_the_backends_own_does(run, imported, tmp_path, add
     assert "template.json" in said and "core-hours" in said
     template = json.loads((out / "template.json").read_text())
     command = [addon("process.backend").python(), "-P", "-m", "torch_backend", "farm", "export", str(imported)]
-    own = tmp_path / "own"
+    by_backend = tmp_path / "own"
     environ = addon("process.children").backend_environ(addon("process.backend").package_root())
-    subprocess.run([*command, "--output", str(own), *words], check=True, env=environ, cwd=tmp_path)
-    assert json.loads((own / "template.json").read_text()) == template
+    subprocess.run([*command, "--output", str(by_backend), *words], check=True, env=environ, cwd=tmp_path)
+    assert json.loads((by_backend / "template.json").read_text()) == template
     assert run("farm", "measure", imported, "--output", out)[0] == 2, "nothing was measured"
 
 
@@ -86,13 +88,13 @@ def test_a_bake_in_parts_is_the_bake_at_once(run, shot, tmp_path):
     assert run(*bake, parts, "--part", "frames", "--first", "5", "--last", "6")[0] == 0
     assert run(*bake, parts, "--part", "file")[0] == 0
     assert sorted(p.name for p in parts.iterdir()) == ["composited", "shot.blend", "summary.json"]
-    made = {p.name: p.read_bytes() for p in (parts / "composited").iterdir()}
-    assert made == {p.name: p.read_bytes() for p in (whole / "composited").iterdir()} and len(made) == 3
+    frames = {p.name: p.read_bytes() for p in (parts / "composited").iterdir()}
+    assert frames == {p.name: p.read_bytes() for p in (whole / "composited").iterdir()} and len(frames) == 3
     assert json.loads((parts / "summary.json").read_text())["composited_frames"] == 3
     bpy.ops.wm.read_homefile(use_empty=True)  # shot.blend is not the artist's file
     assert run(*bake, tmp_path / "alone")[0] == 0
-    assert made == {p.name: p.read_bytes() for p in (tmp_path / "alone" / "composited").iterdir()}
-    assert not [name for name, data in made.items() if b"tEXtFrame" in data], "its digits are those of the range"
+    assert frames == {p.name: p.read_bytes() for p in (tmp_path / "alone" / "composited").iterdir()}
+    assert not [name for name, data in frames.items() if b"tEXtFrame" in data], "its digits are those of the range"
 
 
 def test_a_part_of_a_bake_freezes_nothing(run, shot, tmp_path):
@@ -100,18 +102,18 @@ def test_a_part_of_a_bake_freezes_nothing(run, shot, tmp_path):
     assert code == 7 and "A bake with --part does not freeze frames" in err and sys.executable not in err
 
 
-def test_what_the_shot_lacks_is_asked_for_and_nothing_else(scene, imported, addon, contract):
+def test_farm_export_requests_only_missing_steps(scene, imported, addon, contract):
     scene.splannequin.shot_path = str(imported)
-    there = contract.ShotFolder(imported)
+    shot_folder = contract.ShotFolder(imported)
     assert set(addon("bake.farm").requests_of(scene, imported)) == {"freeze"}, "it is solved, and has this run"
     scene.splannequin.run_name = "other"
     assert set(addon("bake.farm").requests_of(scene, imported)) == {"train", "freeze"}
-    for record in (there.solve_record, there.cameras):
+    for record in (shot_folder.solve_record, shot_folder.cameras):
         record.unlink(missing_ok=True)
     assert set(addon("bake.farm").requests_of(scene, imported)) == {"solve", "train", "freeze"}
 
 
-def test_no_request_is_written_where_there_is_no_backend(addon, tmp_path, monkeypatch, contract):
+def test_no_request_is_written_without_a_backend(addon, tmp_path, monkeypatch, contract):
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "absent"))
     with pytest.raises(contract.JobError, match="does not exist"):
         addon("bake.farm_job").begin(contract.FarmWords(output=str(tmp_path / "job")), {})

@@ -60,7 +60,7 @@ def test_a_take_of_another_camera_is_not_shown_through_the_clips(bake):
     assert plate.image.filepath.endswith(".png")
 
 
-def test_an_artists_own_file_is_left_as_it_is(bake, tmp_path):
+def test_existing_artist_file_is_not_changed(bake, tmp_path):
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     before = views()
     scene = bpy.context.scene

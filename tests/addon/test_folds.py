@@ -27,7 +27,7 @@ def look_again(addon, watch):
     watch.state = addon("shot.inventory").read(watch.shot)
 
 
-def test_a_new_scene_has_the_import_open_alone(scene):
+def test_new_scene_shows_only_the_import_panel_open(scene):
     assert opened(scene) == ["import"]
 
 
@@ -41,7 +41,7 @@ def test_each_step_opens_when_those_before_it_are_done(addon, with_shot, watch, 
         assert opened(with_shot) == [step]
 
 
-def test_what_ended_stays_open_beside_the_next_until_another_begins(addon, contract, with_shot, watch, shot):
+def test_finished_step_stays_open_until_another_begins(addon, contract, with_shot, watch, shot):
     timer = addon("process.job_timer")
     addon("solve.arrival").load_camera(with_shot, shot)
     job = addon("process.jobs").new_job(shot, "freeze", contract.FreezeParams())
@@ -74,7 +74,7 @@ def test_the_artist_opens_and_closes_as_they_like(addon, scene, with_shot, watch
     assert opened(with_shot) == ["train", "freeze"], "what is at hand opens beside what the artist opened"
 
 
-def test_a_step_that_was_opened_ahead_closes_once_it_is_done(addon, with_shot, watch, shot, tmp_path):
+def test_step_opened_early_closes_when_done(addon, with_shot, watch, shot, tmp_path):
     addon("solve.arrival").load_camera(with_shot, shot)
     shutil.move(shot / "takes" / "freeze", tmp_path / "kept")
     shutil.move(shot / "runs" / "main", tmp_path / "run")
@@ -96,7 +96,7 @@ def test_a_missing_shot_opens_the_import(addon, with_shot, watch, shot):
     assert opened(with_shot) == ["import"]
 
 
-def test_other_shots_and_copies_of_settings_keep_their_own(addon, with_shot, watch, shot, tmp_path):
+def test_folded_panels_are_stored_per_shot(addon, with_shot, watch, shot, tmp_path):
     addon("solve.arrival").load_camera(with_shot, shot)
     with_shot.splannequin.is_train_open = True
     addon("shot.selection").add(with_shot)

@@ -14,8 +14,8 @@ def small_disk(tmp_path: Path):
     """A file system of 8 MB."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(disk)], capture_output=True)
-    if sys.platform != "linux" or made.returncode:
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(disk)], capture_output=True)
+    if sys.platform != "linux" or mounted.returncode:
         pytest.skip("mounting needs Linux and root")
     yield disk
     subprocess.run(["umount", "-l", str(disk)], check=True)
@@ -64,9 +64,7 @@ def test_a_full_disk_is_said_and_earlier_frames_stay(addon, shot, small_disk, ar
     assert main([*bake[:-1], "file"]) == 7, "a picture of nothing is none"
 
 
-def test_a_file_that_a_full_disk_cuts_off_is_said_and_the_earlier_one_stays(
-    addon, shot, small_disk, artists_file, capfd
-):
+def test_full_disk_is_reported_and_keeps_the_previous_file(addon, shot, small_disk, artists_file, capfd):
     """Blender 5.2 reports a truncated compressed file as saved."""
     bpy.context.preferences.filepaths.use_file_compression = True
     bake = ["bake", "--shot", shot, "--output", small_disk, "--blend", artists_file("PNG")]

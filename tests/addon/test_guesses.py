@@ -51,7 +51,7 @@ def marked(scene) -> list[tuple[str, int]]:
     return sorted((m.name, m.frame) for m in scene.timeline_markers)
 
 
-def test_keys_of_guesses_have_their_own_colour(addon, failed, shot):
+def test_keyframes_of_guessed_frames_have_a_distinct_colour(addon, failed, shot):
     camera = addon("solve.cameras").build(failed, shot)
     want = ["KEYFRAME"] * 2 + ["EXTREME"] * 3 + ["JITTER", "KEYFRAME", "EXTREME"]
     for curve in addon("compat_animation").fcurves(camera):
@@ -83,6 +83,6 @@ def test_markers_are_part_of_the_undo_step_and_of_the_file(addon, failed, shot, 
     assert not len(bpy.context.scene.timeline_markers)
 
 
-def test_the_camera_step_says_how_many_are_guesses(addon, failed, shot):
+def test_camera_step_reports_the_number_of_guessed_frames(addon, failed, shot):
     lines = addon("process.steps").STEPS["solve"].view(failed, addon("shot.inventory").read(shot)).state
     assert lines == ["A poor solve.", "4 of 8 frames have a guessed camera, shown as pink keys on the timeline."]

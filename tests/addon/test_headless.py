@@ -96,9 +96,9 @@ def test_python_in_the_artists_file_does_not_run(run, shot, tmp_path, kind):
         text.write(call)
         text.use_module = True
     else:
-        thing = bpy.data.objects.new("driven", None)
-        bpy.context.scene.collection.objects.link(thing)
-        driver = thing.driver_add("location", 0).driver
+        driven = bpy.data.objects.new("driven", None)
+        bpy.context.scene.collection.objects.link(driven)
+        driver = driven.driver_add("location", 0).driver
         driver.type = "SCRIPTED"
         bpy.context.preferences.filepaths.use_scripts_auto_execute = False
         driver.expression = f"{call} or 1.0"
@@ -207,7 +207,7 @@ def test_a_bake_ends_with_the_launcher_that_started_it(shot, tmp_path, root, sta
     bake.stderr.close()
 
 
-def told_of(parser: argparse.ArgumentParser) -> dict[str, dict[str, tuple]]:
+def option_help(parser: argparse.ArgumentParser) -> dict[str, dict[str, tuple]]:
     """Map from verb to option to (help, choices, default, value, required), as printed by --help."""
     verbs = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices
     return {
@@ -228,7 +228,7 @@ def told_of(parser: argparse.ArgumentParser) -> dict[str, dict[str, tuple]]:
 
 def test_both_command_lines_print_the_same_options_for_the_same_verb(addon, package):
     backend = importlib.import_module(f"{package.__name__}.torch_backend.cli")
-    ours, theirs = told_of(addon("command_line.headless").parser()), told_of(backend.parser())
+    ours, theirs = option_help(addon("command_line.headless").parser()), option_help(backend.parser())
     assert ours.keys() - theirs.keys() == {"bake"}
     assert theirs.keys() - ours.keys() == {"take", "run-job", "live", "farm-task"}
     for verb in ours.keys() & theirs.keys():
@@ -241,7 +241,7 @@ def test_both_command_lines_print_the_same_options_for_the_same_verb(addon, pack
         assert ours[verb] == theirs[verb], verb
 
 
-def test_freeze_of_a_shot_is_the_step_alone(run, root, tmp_path):
+def test_freeze_of_a_shot_runs_only_that_step(run, root, tmp_path):
     shot = tmp_path / "stored.splannequin"
     shutil.copytree(root / "tests" / "data" / "shot", shot)
     words = ("--run", "tiny", "--t-star", 8, "--take", "again", "--detail", "off", "--develop", "off",
@@ -255,21 +255,21 @@ def test_freeze_of_a_shot_is_the_step_alone(run, root, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tmp_path):
+def test_command_line_options_reach_the_backend(addon, contract, monkeypatch, tmp_path):
     headless = addon("command_line.headless")
     monkeypatch.setattr(addon("process.backend"), "device", lambda: "cpu")  # stands for a choice in the preferences
 
-    def asked(*words):
+    def requested(*words):
         return headless.requested_params(headless.parser().parse_args([str(w) for w in words]))
 
-    train = asked("train", tmp_path, "--method", "mlp", "--host", "mlp", "--host-config", "reference",
+    train = requested("train", tmp_path, "--method", "mlp", "--host", "mlp", "--host-config", "reference",
                   "--detector", "weight")["train"]  # fmt: skip
     assert (train.method, train.host, train.host_config, train.detector) == ("mlp", "mlp", "reference", "weight")
-    assert train.device == "cpu" and asked("train", tmp_path, "--device", "cuda")["train"].device == "cuda"
-    frozen = asked("freeze", "a.mp4", "--no-grain", "--camera-path", tmp_path / "p.json")["freeze"]
+    assert train.device == "cpu" and requested("train", tmp_path, "--device", "cuda")["train"].device == "cuda"
+    frozen = requested("freeze", "a.mp4", "--no-grain", "--camera-path", tmp_path / "p.json")["freeze"]
     assert (frozen.grain, frozen.camera_path, frozen.device) == (False, str(tmp_path / "p.json"), "cpu")
     assert frozen.only_missing, "frames that are finished are not rendered again"
-    assert asked("import", tmp_path, "a.0001.png", "--fps", 25)["import"].fps == 25.0
+    assert requested("import", tmp_path, "a.0001.png", "--fps", 25)["import"].fps == 25.0
 
 
 def test_an_output_that_cannot_be_is_one_sentence(run, shot, clip, tmp_path):

@@ -32,18 +32,18 @@ def test_scrubbing(addon, trap, shot, root):
 
 
 def test_st_maps(addon, contract, trap, shot):
-    asked = addon("solve.stmaps").begin(shot)
-    asked.wait()
+    question = addon("solve.stmaps").begin(shot)
+    question.wait()
     with pytest.raises(contract.JobError):  # the shot has no lens distortion
-        addon("solve.stmaps").answer(asked)
+        addon("solve.stmaps").answer(question)
     assert not trap.exists(), trap.read_text()
 
 
 def test_exported_cameras(addon, contract, trap, shot):
     solves = addon("solve.exchange")
     words = contract.ExportWords(shot=str(shot), format="nerfstudio", output=str(shot / "out"))
-    asked = solves.begin_export(words)
-    assert str(shot / "out") in solves.exported(asked, shot / "out")
+    question = solves.begin_export(words)
+    assert str(shot / "out") in solves.exported(question, shot / "out")
     assert (shot / "out" / "transforms.json").is_file()
     assert not trap.exists(), trap.read_text()
 
@@ -58,14 +58,14 @@ def test_a_job(addon, contract, trap, hostile, shot, root):
     assert not trap.exists(), trap.read_text()
 
 
-def test_a_child_stands_beside_its_interpreter(addon, contract):
+def test_child_runs_in_the_folder_of_its_interpreter(addon, contract):
     """Windows loads libraries from the working folder, and locks that folder against moving."""
     python = addon("process.backend").python()
     child = contract.python_child(python, "torch_backend", "doctor")
     assert child["cwd"] == os.path.dirname(os.path.abspath(python))
 
 
-def test_a_program_beside_the_blend_file_is_none_of_the_path(contract, tmp_path, monkeypatch):
+def test_programs_next_to_the_blend_file_are_not_on_the_path(contract, tmp_path, monkeypatch):
     fake = tmp_path / "nvidia-smi"
     fake.write_text("#!/bin/sh\n")
     fake.chmod(0o755)

@@ -43,10 +43,10 @@ def test_the_second_shot_of_the_list_starts_at_its_current_frame_too(with_shot, 
     assert with_shot.splannequin.t_star == 6
 
 
-@pytest.mark.parametrize(("asked", "held"), [(411, 7), (-3, 5), (6, 6)])
-def test_t_star_is_held_within_the_clip(with_shot, asked, held):
-    with_shot.splannequin.t_star = asked
-    assert with_shot.splannequin.t_star == held
+@pytest.mark.parametrize(("requested", "clamped"), [(411, 7), (-3, 5), (6, 6)])
+def test_t_star_is_clamped_to_the_clip(with_shot, requested, clamped):
+    with_shot.splannequin.t_star = requested
+    assert with_shot.splannequin.t_star == clamped
 
 
 def test_a_take_is_done_while_it_is_what_freeze_would_make_now(addon, with_shot, shot):
@@ -77,7 +77,7 @@ def test_a_take_of_the_clips_move_is_not_done_for_a_camera_of_the_artists(addon,
     assert "camera" in view(addon, with_shot, shot).advice and "clip" not in view(addon, with_shot, shot).advice
 
 
-def test_overscan_in_percent_is_asked_for(addon, with_shot):
+def test_overscan_percentage_reaches_the_request(addon, with_shot):
     props, params = with_shot.splannequin, addon("freeze.takes").params_of
     props.overscan_percent = 12.5
     assert params(with_shot).overscan == 0.0
@@ -93,7 +93,7 @@ def test_overscan_in_percent_is_asked_for(addon, with_shot):
         (("a/shot", "b/other"), ["shot", "other"]),
     ],
 )
-def test_shots_of_one_name_are_told_apart_in_the_list(addon, scene, tmp_path, places, called):
+def test_shots_with_the_same_name_have_distinct_list_entries(addon, scene, tmp_path, places, called):
     for n, place in enumerate(places):
         if n:
             bpy.ops.splannequin.shot_add()

@@ -81,7 +81,7 @@ def test_a_shot_that_cannot_be_read_for_a_moment_is_read_again(contract, supervi
     assert "import" not in watch.failures
 
 
-def test_one_that_breaks_does_not_end_the_timer_for_the_others(supervisor, capfd):
+def test_failing_callback_does_not_stop_the_timer(supervisor, capfd):
     calls = []
     supervisor.call_until_false(lambda: 1 / 0)
     supervisor.call_until_false(lambda: len(calls) < 2 and not calls.append(len(calls)))
@@ -91,7 +91,7 @@ def test_one_that_breaks_does_not_end_the_timer_for_the_others(supervisor, capfd
     assert capfd.readouterr().err.count("ZeroDivisionError") == 1
 
 
-def test_a_bake_whose_frames_are_there_comes_in_in_turns(addon, contract, supervisor, watch, shot):
+def test_bake_with_finished_frames_is_inserted_step_by_step(addon, contract, supervisor, watch, shot):
     """The turns are: read a picture, read the next, change the compositor, render. Blender blocks during each turn."""
     params = contract.FreezeParams(take="freeze")
     job = addon("process.jobs").new_job(shot, "freeze", params)
@@ -132,13 +132,13 @@ def baked(addon) -> list[str]:
     return [s.name for s in bpy.data.scenes if tree(s) is not None and group_node(tree(s)) is not None]
 
 
-def test_a_bake_comes_into_the_scene_where_it_was_asked_for_alone(addon, contract, supervisor, watch, shot):
-    other = bpy.data.scenes.new("A lookdev")
-    other.splannequin.shot_path = str(shot)
-    before = other.view_settings.view_transform
+def test_bake_is_inserted_only_into_the_requesting_scene(addon, contract, supervisor, watch, shot):
+    second_scene = bpy.data.scenes.new("A lookdev")
+    second_scene.splannequin.shot_path = str(shot)
+    before = second_scene.view_settings.view_transform
     ended_bake(addon, contract, supervisor, watch, shot, "Scene")
     until_it_renders(supervisor, watch)
-    assert baked(addon) == ["Scene"] and other.view_settings.view_transform == before and not watch.failures
+    assert baked(addon) == ["Scene"] and second_scene.view_settings.view_transform == before and not watch.failures
     addon("bake.insertion").remove(bpy.data.scenes["Scene"])
     watch.work = None
     ended_bake(addon, contract, supervisor, watch, shot, "A lookdev")
@@ -147,8 +147,8 @@ def test_a_bake_comes_into_the_scene_where_it_was_asked_for_alone(addon, contrac
 
 
 def test_a_bake_of_a_scene_that_is_gone_comes_into_those_of_the_shot(addon, contract, supervisor, watch, shot):
-    other = bpy.data.scenes.new("A lookdev")
-    other.splannequin.shot_path = str(shot)
+    second_scene = bpy.data.scenes.new("A lookdev")
+    second_scene.splannequin.shot_path = str(shot)
     ended_bake(addon, contract, supervisor, watch, shot, "deleted since")
     until_it_renders(supervisor, watch)
     assert sorted(baked(addon)) == ["A lookdev", "Scene"]
@@ -158,8 +158,8 @@ def test_a_bake_comes_into_its_scene_though_that_is_renamed_meanwhile(addon, con
     """It is renamed during the job and between the turns. Another scene gets its old name."""
     uid = scene.session_uid
     scene.name = "renamed"
-    other = bpy.data.scenes.new("Scene")
-    other.splannequin.shot_path = str(shot)
+    second_scene = bpy.data.scenes.new("Scene")
+    second_scene.splannequin.shot_path = str(shot)
     ended_bake(addon, contract, supervisor, watch, shot, "Scene", uid)
     supervisor.tick()
     scene.name = "renamed again"
@@ -167,19 +167,19 @@ def test_a_bake_comes_into_its_scene_though_that_is_renamed_meanwhile(addon, con
     assert baked(addon) == ["renamed again"] and not watch.failures
 
 
-def test_a_bake_whose_scene_is_deleted_while_it_comes_in_changes_no_other(addon, contract, supervisor, watch, shot):
-    other = bpy.data.scenes.new("A lookdev")
-    other.splannequin.shot_path = str(shot)
-    ended_bake(addon, contract, supervisor, watch, shot, "A lookdev", other.session_uid)
-    bpy.data.scenes.remove(other)
+def test_bake_of_a_deleted_scene_changes_no_other_scene(addon, contract, supervisor, watch, shot):
+    second_scene = bpy.data.scenes.new("A lookdev")
+    second_scene.splannequin.shot_path = str(shot)
+    ended_bake(addon, contract, supervisor, watch, shot, "A lookdev", second_scene.session_uid)
+    bpy.data.scenes.remove(second_scene)
     for _ in range(4):
         supervisor.tick()
     assert watch.work is None and baked(addon) == [] and not watch.failures
 
 
-def test_a_bake_of_a_scene_that_has_another_shot_now_is_only_told_of(addon, contract, supervisor, watch, shot):
-    other = bpy.data.scenes.new("A lookdev")
-    other.splannequin.shot_path = str(shot)
+def test_bake_is_only_reported_if_the_scene_changed_its_shot(addon, contract, supervisor, watch, shot):
+    second_scene = bpy.data.scenes.new("A lookdev")
+    second_scene.splannequin.shot_path = str(shot)
     bpy.data.scenes["Scene"].splannequin.shot_path = str(shot.parent / "another.splannequin")
     ended_bake(addon, contract, supervisor, watch, shot, "Scene")
     assert watch.work is None and baked(addon) == [] and "Bake again" in watch.notes["bake"][0]
@@ -195,22 +195,22 @@ def test_a_job_keeps_the_name_of_its_scene(addon, contract, scene, shot):
     assert addon("process.steps").scene_of(found) == "Comp é" and addon("process.steps").step_of(found) == "bake"
 
 
-def test_a_job_names_the_blend_that_it_was_started_from_in_every_other_one(addon, contract, scene, shot):
-    other = addon("ui.step_panel").started_elsewhere
+def test_job_names_the_blend_file_that_started_it(addon, contract, scene, shot):
+    started_in = addon("ui.step_panel").started_elsewhere
     scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), "freeze"
     bpy.ops.wm.save_as_mainfile(filepath=str(shot.parent / "a é.blend"))
     job = addon("process.begin").begin(bpy.context.scene, "freeze")
-    assert job.blend == "a é.blend" and not other(job)
+    assert job.blend == "a é.blend" and not started_in(job)
     with pytest.raises(contract.JobError):  # the shot has no run
         addon("process.begin").wait(job)
     addon("process.job_timer").forget()
     found = addon("process.job_timer").watch_of(shot).jobs["freeze"]
-    assert not other(found), "the same file"
+    assert not started_in(found), "the same file"
     bpy.ops.wm.save_as_mainfile(filepath=str(shot.parent / "b.blend"))
-    assert other(found) and found.blend == "a é.blend"
+    assert started_in(found) and found.blend == "a é.blend"
     (found.folder / contract.BLEND_FILE).unlink()
     addon("process.job_timer").forget()
-    assert not other(addon("process.job_timer").watch_of(shot).jobs["freeze"]), "of a command line"
+    assert not started_in(addon("process.job_timer").watch_of(shot).jobs["freeze"]), "of a command line"
 
 
 def test_a_job_that_had_ended_before_it_was_met_renders_nothing(addon, contract, supervisor, scene, shot, monkeypatch):
@@ -278,7 +278,7 @@ def test_no_draw_is_interrupted_while_a_render_goes_on(small):
 
 
 @pytest.fixture
-def movie_to_nowhere(scene, tmp_path):
+def unwritable_movie(scene, tmp_path):
     """Scene that writes a movie into a folder that cannot be created: Blender calls no handler at the end of its
     render."""
     (tmp_path / "file").write_text("")
@@ -304,7 +304,7 @@ def test_a_render_that_tells_no_end_is_over(addon, supervisor, watch, shot, smal
     assert scene.render.filepath.endswith("f_####")
 
 
-def test_a_render_that_wrote_nothing_is_no_success(watch, movie_to_nowhere):
+def test_a_render_that_wrote_nothing_is_no_success(watch, unwritable_movie):
     with pytest.raises(RuntimeError, match="where a folder is needed"):
         bpy.ops.splannequin.render("EXEC_DEFAULT")
     assert watch.running() is None
@@ -386,7 +386,7 @@ def solving(addon, contract, supervisor, watch, shot):
     job.process.wait()
 
 
-def test_the_camera_arrives_while_the_solve_goes_on_and_its_end_leaves_it_alone(addon, scene, shot, watch, solving):
+def test_camera_arrives_during_the_solve_and_is_not_replaced_at_its_end(addon, scene, shot, watch, solving):
     job, tell = solving
     find = addon("solve.cameras").find
     tell("progress", stage="solve", done=1, total=2, message="")
@@ -395,12 +395,12 @@ def test_the_camera_arrives_while_the_solve_goes_on_and_its_end_leaves_it_alone(
     camera = find(scene, shot, "CAMERA")
     assert watch.running() == "solve" and scene.camera == camera and camera.data.background_images[0].image
     assert "is the scene's camera" in watch.notes["solve"][0]
-    own = scene.camera = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    artists_camera = scene.camera = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
     camera.data.background_images[0].alpha = 0.5
     tell("progress", stage="solve", done=3, total=4, message="")
     tell("done", "done", state="done", result={})
     assert job.ended and watch.running() is None and not watch.failures
-    assert scene.camera == own and camera.data.background_images[0].alpha == 0.5
+    assert scene.camera == artists_camera and camera.data.background_images[0].alpha == 0.5
     assert find(scene, shot, "CAMERA") == camera
 
 

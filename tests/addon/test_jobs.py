@@ -95,8 +95,8 @@ def test_a_killed_child_leaves_a_status_that_says_so(addon, contract, start_impo
     os.kill(job.process.pid, signal.SIGKILL)
     with pytest.raises(contract.JobError, match="stopped unexpectedly"):
         jobs.wait(job)
-    told = json.loads((job.folder / "status.json").read_text())
-    assert told["state"] == "failed" and "memory" in told["hint"]
+    status = json.loads((job.folder / "status.json").read_text())
+    assert status["state"] == "failed" and "memory" in status["hint"]
     again = jobs.open_job(job.folder)
     jobs.poll(again)
     assert again.state == "failed", "another Blender reads the same"
@@ -163,20 +163,20 @@ def test_the_childs_environment_is_free_of_blenders_python(addon, monkeypatch, r
     assert "PYTHONHOME" not in environ and environ["PYTHONPATH"] == str(root)
 
 
-def test_an_answer_that_no_pipe_holds_is_read_while_it_is_given(addon, tmp_path):
+def test_answer_larger_than_a_pipe_is_read_while_written(addon, tmp_path):
     """An unread pipe holds 64 KB on Linux and 4 KB on Windows; the traceback of a library that fails to load is
     longer."""
     (tmp_path / "torch_backend").mkdir()
     words = "import sys; sys.stderr.write('x' * 300000); sys.stdout.write('y' * 300000)"
     (tmp_path / "torch_backend" / "__main__.py").write_text(f"{words}; sys.stdout.buffer.write(bytes([255]))")
-    asked = addon("process.children").ask(sys.executable, tmp_path, "doctor")
+    question = addon("process.children").ask(sys.executable, tmp_path, "doctor")
     until = time.monotonic() + 30.0
-    while not asked.ended and time.monotonic() < until:  # like the timer, which never blocks
+    while not question.ended and time.monotonic() < until:  # like the timer, which never blocks
         time.sleep(0.05)
     try:
-        assert asked.ended and asked.answer("{}") == "y" * 300000 + "\N{REPLACEMENT CHARACTER}"
+        assert question.ended and question.answer("{}") == "y" * 300000 + "\N{REPLACEMENT CHARACTER}"
     finally:
-        asked.process.kill()
+        question.process.kill()
 
 
 def test_a_python_that_does_not_start_is_an_environment_error(addon, contract, empty_shot, root):
@@ -194,7 +194,7 @@ def test_new_job_refuses_the_parameters_of_another_kind(addon, contract, empty_s
         addon("process.jobs").new_job(empty_shot, "train", contract.SolveParams())
 
 
-def test_a_broken_write_leaves_what_was_there(contract, tmp_path):
+def test_failed_write_keeps_the_previous_file(contract, tmp_path):
     target = tmp_path / "a.json"
     contract.write_json(target, {"a": 1})
     with pytest.raises(ValueError):
@@ -202,7 +202,7 @@ def test_a_broken_write_leaves_what_was_there(contract, tmp_path):
     assert json.loads(target.read_text()) == {"a": 1} and [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_cancel_pressed_again_does_not_put_off_the_end_by_force(addon, contract, empty_shot):
+def test_second_cancel_does_not_delay_the_kill(addon, contract, empty_shot):
     jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     jobs.cancel(job)
@@ -302,25 +302,27 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
         contract.computer_name(), worker.pid, started, "train", "from a terminal", time.time() - 90000
     )
     contract.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
-    with pytest.raises(contract.JobError) as told:
+    with pytest.raises(contract.JobError) as refused:
         addon("process.begin").begin(scene, "import")
-    assert told.value.exit_code == contract.ExitCode.USAGE and told.value.hint == "Wait for it or cancel it."
+    assert refused.value.exit_code == contract.ExitCode.USAGE and refused.value.hint == "Wait for it or cancel it."
     since = time.strftime("%Y-%m-%d %H:%M", time.localtime(writer.since))
     where = contract.computer_name().partition(" (")[0]
-    assert told.value.message == f"The training of {empty_shot.name} has been running on {where} since {since}."
-    german = addon("translations").translate(told.value.message, "de_DE")
+    assert refused.value.message == f"The training of {empty_shot.name} has been running on {where} since {since}."
+    german = addon("translations").translate(refused.value.message, "de_DE")
     assert german == f"Das Training von {empty_shot.name} läuft seit {since} auf {where}."
     assert not (empty_shot / "jobs").exists(), "nothing was written"
     contract.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, host="elsewhere")))
-    with pytest.raises(contract.JobError, match="on elsewhere since") as told:
+    with pytest.raises(contract.JobError, match="on elsewhere since") as refused:
         addon("process.begin").begin(scene, "import")
-    assert str(empty_shot / "lock.json") in told.value.hint
+    assert str(empty_shot / "lock.json") in refused.value.hint
     ending = jobs.new_job(empty_shot, "train", contract.TrainParams())
     contract.write_json(
         empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name))
     )
-    told = contract.Status("train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.computer_name())
-    contract.write_json(ending.folder / "status.json", dataclasses.asdict(told))
+    refused = contract.Status(
+        "train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.computer_name()
+    )
+    contract.write_json(ending.folder / "status.json", dataclasses.asdict(refused))
     jobs.refuse_second_writer(empty_shot)  # the process that reported its end will release the lock soon
     (empty_shot / "lock.json").unlink()
     running = dataclasses.replace(told, state="running", started=writer.since, exit_code=None)
@@ -380,18 +382,18 @@ def test_cancel_follows_no_link(addon, contract, empty_shot, tmp_path):
     assert not (tmp_path / "elsewhere").exists()
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("is_moved", [True, False])
 def test_a_job_whose_shot_goes_ends_in_a_sentence_and_makes_nothing(
-    addon, contract, empty_shot, start_import, clip, told
+    addon, contract, empty_shot, start_import, clip, is_moved
 ):
     if sys.platform == "win32":
         pytest.skip("Windows keeps a folder that a process works in where it is")
-    jobs, away = addon("process.jobs"), empty_shot.with_name("away.splannequin")
+    jobs, moved = addon("process.jobs"), empty_shot.with_name("away.splannequin")
     job = start_import(clip)
     while jobs.poll(job, 0.5) == [] and not job.ended:
         time.sleep(0.02)
-    empty_shot.rename(away)
-    if not told:
+    empty_shot.rename(moved)
+    if not is_moved:
         job.process.kill()
     with pytest.raises(contract.JobError, match="^The import ended: the shot folder .* was moved or deleted") as caught:
         jobs.wait(job)
@@ -399,5 +401,5 @@ def test_a_job_whose_shot_goes_ends_in_a_sentence_and_makes_nothing(
     assert not empty_shot.exists()
     with pytest.raises(FileNotFoundError):
         jobs.new_job(empty_shot, "import", contract.ImportParams())
-    found = jobs.latest(away)["import"]
-    assert found.state == "failed" and ("was moved or deleted" in found.status.message) == told
+    found = jobs.latest(moved)["import"]
+    assert found.state == "failed" and ("was moved or deleted" in found.status.message) == is_moved

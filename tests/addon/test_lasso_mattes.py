@@ -42,8 +42,8 @@ def test_polygons_are_what_blender_renders_of_a_mask(addon, shot, handle, size):
     corners = [(30.0, 20.0), (70.0, 25.0), (80.0, 70.0), (25.0, 60.0)]
     mask = mask_of("thing", corners, width, height, handle)
     listing = shot / "frames" / "frames.json"
-    told = json.loads(listing.read_text())
-    listing.write_text(json.dumps({**told, "width": width, "height": height}))
+    polygons = json.loads(listing.read_text())
+    listing.write_text(json.dumps({**polygons, "width": width, "height": height}))
     file = addon("solve.drawn_masks").render(mask, shot, "people") / "000006.png"
     rendered = read(file)[..., 0] > 0.5
     (polygon,) = addon("freeze.mattes").polygons(mask, width, height)
@@ -60,9 +60,9 @@ def test_polygons_are_what_blender_renders_of_a_mask(addon, shot, handle, size):
 @pytest.fixture(scope="module")
 def world(frozen_world):
     """A frozen take of the backend's tiny world: (shot folder, masks by frame, outline at frame 107)."""
-    told = json.loads((frozen_world / "truth.json").read_text())
-    masks = {int(frame): np.array(mask, bool) for frame, mask in told["masks"].items()}
-    return frozen_world / "tiny.splannequin", masks, told["outline"]
+    truth = json.loads((frozen_world / "truth.json").read_text())
+    masks = {int(frame): np.array(mask, bool) for frame, mask in truth["masks"].items()}
+    return frozen_world / "tiny.splannequin", masks, truth["outline"]
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, 
     assert not single.exists()
 
 
-def test_what_cannot_be_made_is_a_sentence(addon, chosen, world):
+def test_uncreatable_paths_give_a_readable_error(addon, chosen, world):
     mattes, scene = addon("freeze.mattes"), bpy.context.scene
     with pytest.raises(addon("freeze.mattes").contract.JobError, match="No mask"):
         mattes.params_of(scene, world[0])
@@ -139,7 +139,7 @@ def test_drawing_begins_with_a_mask_and_is_undone(addon, chosen, world):
     assert (first, last) == (104, 110) and image.source == "SEQUENCE"
 
 
-def test_lassos_of_a_stranger_are_not_believed(addon, contract, shot):
+def test_untrusted_lasso_files_are_validated(addon, contract, shot):
     record = contract.TakeFolder(shot / "takes" / "freeze").mattes_record
     record.parent.mkdir(parents=True)
     rows = [{"name": "../x", "frame": 1, "polygon": []}, {"name": "ok", "frame": True, "polygon": []}, 7]

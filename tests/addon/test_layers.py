@@ -11,12 +11,12 @@ import bpy
 import numpy as np
 import pytest
 
-from tests.addon.data import make_detail as made
+from tests.addon.data import make_detail
 from tests.addon.data import make_frames as frames
 from tests.addon.data.pixels import read, render
 
 DATA = Path(__file__).resolve().parent / "data"
-SIZE = made.WIDTH, made.HEIGHT
+SIZE = make_detail.WIDTH, make_detail.HEIGHT
 
 
 @pytest.fixture
@@ -71,18 +71,18 @@ def test_st_map_matte_and_fill_give_the_delivered_frame_back(addon, scene, detai
     tree = addon("compat").compositor_tree(scene)
     tree.links.new(node.outputs["Image"], addon("compat").output_socket(tree))
     found = render(scene, tmp_path, frame)
-    plate, delivered = made.plate(frame), made.frozen(frame)
-    third = made.WIDTH // 3
+    plate, delivered = make_detail.plate(frame), make_detail.frozen(frame)
+    third = make_detail.WIDTH // 3
     assert np.array_equal(found[:, :third, :3], plate[:, :third]), "where nothing moves it is the plate, bit for bit"
     assert delivered.max() > 40 and delivered.min() < -0.1
     assert relative(found[..., :3], delivered) < 1e-3
     node.inputs["As Warp"].default_value = 0.0
-    half, own = (
-        made.frozen(frame).astype(np.float32).astype(np.float16).astype(np.float32),
+    half, take_frame = (
+        make_detail.frozen(frame).astype(np.float32).astype(np.float16).astype(np.float32),
         render(scene, tmp_path, frame),
     )
-    assert relative(own[..., :3], half) < 1e-3, "the take's own frames"
-    assert np.array_equal(own[..., 3], found[..., 3])
+    assert relative(take_frame[..., :3], half) < 1e-3, "the take's own frames"
+    assert np.array_equal(take_frame[..., 3], found[..., 3])
 
 
 def test_the_grade_goes_on_behind_the_warped_plate_and_goes_before_it(addon, scene, detailed, graded, tmp_path):
@@ -90,21 +90,23 @@ def test_the_grade_goes_on_behind_the_warped_plate_and_goes_before_it(addon, sce
     addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     node = node_of(addon, scene)
     assert node.inputs["Image"].links[0].from_node.bl_idname == "CompositorNodeImage", "as the plate"
-    assert relative(render(scene, tmp_path)[..., :3], made.frozen(6) * GRADE) < 1e-3
+    assert relative(render(scene, tmp_path)[..., :3], make_detail.frozen(6) * GRADE) < 1e-3
     scene.splannequin.insert_at = "OUTPUT"
     addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node = node_of(addon, scene)
     assert compat.output_socket(graded).links[0].from_node == node and addon("bake.freeze_group").wants_warp(scene)
-    moved = made.WIDTH * 2 // 3  # columns from here on are not pure plate, and are not graded
-    expected = made.moved(made.plate(6) * GRADE, 6)
+    moved = make_detail.WIDTH * 2 // 3  # columns from here on are not pure plate, and are not graded
+    expected = make_detail.moved(make_detail.plate(6) * GRADE, 6)
     assert relative(render(scene, tmp_path)[:, :moved, :3], expected[:, :moved]) < 1e-3
 
 
 def test_a_plate_of_another_size_is_brought_to_that_of_the_warp(addon, scene, detailed, graded, tmp_path):
     """Plate and render are half as large as the warp. The plate has one colour, so the whole picture must have it."""
-    compat, small = addon("compat"), np.zeros((made.HEIGHT // 2, made.WIDTH // 2, 4), np.float32)
+    compat, small = addon("compat"), np.zeros((make_detail.HEIGHT // 2, make_detail.WIDTH // 2, 4), np.float32)
     small[..., 0], small[..., 3] = 40.0, 1.0
-    picture = bpy.data.images.new("small", made.WIDTH // 2, made.HEIGHT // 2, float_buffer=True, is_data=True)
+    picture = bpy.data.images.new(
+        "small", make_detail.WIDTH // 2, make_detail.HEIGHT // 2, float_buffer=True, is_data=True
+    )
     picture.pixels.foreach_set(small.ravel())
     addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     node = node_of(addon, scene)
@@ -112,8 +114,8 @@ def test_a_plate_of_another_size_is_brought_to_that_of_the_warp(addon, scene, de
     reader.image = picture
     graded.links.new(reader.outputs["Image"], node.inputs["Image"])
     graded.links.new(node.outputs["Image"], compat.output_socket(graded))
-    found = render(scene, tmp_path, size=(made.WIDTH // 2, made.HEIGHT // 2))
-    inner = np.s_[2:-2, 2 : made.WIDTH // 6]
+    found = render(scene, tmp_path, size=(make_detail.WIDTH // 2, make_detail.HEIGHT // 2))
+    inner = np.s_[2:-2, 2 : make_detail.WIDTH // 6]
     assert np.abs(found[inner][..., 0] - 40.0).max() < 0.01 and np.abs(found[inner][..., 1]).max() < 1e-6
 
 
@@ -188,14 +190,14 @@ def test_a_take_without_a_warp_is_refused_in_a_sentence(addon, contract, scene, 
         bpy.ops.splannequin.freeze_as_warp()
 
 
-def test_a_take_from_a_camera_of_the_artists_own_is_refused_in_a_sentence(addon, contract, scene, detailed, graded):
+def test_warp_of_a_take_with_an_artists_camera_is_refused_readably(addon, contract, scene, detailed, graded):
     file = detailed / "takes" / "detail" / "take.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "camera_path": "/somewhere/path.json"}))
     with pytest.raises(contract.JobError, match="needs other frames of the plate"):
         addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
 
 
-def test_a_bake_of_a_take_without_a_warp_shows_its_frames_and_says_so(addon, scene, detailed, graded):
+def test_bake_without_a_warp_shows_frames_and_warns(addon, scene, detailed, graded):
     addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     said = addon("bake.insertion").insert_freeze(scene, detailed, "freeze")
     assert "The take has no warp: its own frames are shown." in said and "As Warp" not in node_of(addon, scene).inputs
@@ -203,7 +205,7 @@ def test_a_bake_of_a_take_without_a_warp_shows_its_frames_and_says_so(addon, sce
     assert "As Warp" in node_of(addon, scene).inputs, "the next take that has one is used as such again"
 
 
-def test_pictures_read_ahead_for_a_warp_are_those_that_come_in(addon, scene, detailed, graded):
+def test_prefetched_warp_pictures_are_used_on_arrival(addon, scene, detailed, graded):
     bake = addon("bake.insertion")
     addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     count = len(bpy.data.images)
@@ -217,11 +219,11 @@ def test_what_is_invented_is_tinted_and_the_rest_is_not(addon, scene, detailed, 
     addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node_of(addon, scene).inputs["Show What Is Invented"].default_value = show
     found = render(scene, tmp_path)
-    half = made.frozen(6).astype(np.float32).astype(np.float16).astype(np.float64)
-    invented = 0.6 * show * (1.0 - made.matte(6) * made.alpha())[..., None]
+    half = make_detail.frozen(6).astype(np.float32).astype(np.float16).astype(np.float64)
+    invented = 0.6 * show * (1.0 - make_detail.matte(6) * make_detail.alpha())[..., None]
     expected = half + invented * (np.array([1.0, 0.0, 0.4]) - half)
     assert relative(found[..., :3], expected) < 1e-3
-    third = np.s_[:, : made.WIDTH // 3]
+    third = np.s_[:, : make_detail.WIDTH // 3]
     assert relative(found[third][..., :3], half[third]) < 1e-3, "not tinted"
 
 
@@ -279,22 +281,22 @@ def test_plate_and_source_leave_the_group_as_they_are_in_the_file(addon, scene, 
     addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     tree = compat.compositor_tree(scene)
     tree.links.new(node_of(addon, scene).outputs[output], compat.output_socket(tree))
-    expected = made.matte(6) * made.alpha() if output == "Plate" else made.source(6)
+    expected = make_detail.matte(6) * make_detail.alpha() if output == "Plate" else make_detail.source(6)
     assert np.array_equal(render(scene, tmp_path)[..., 0], expected)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
-def test_the_splats_alone_can_be_had(addon, scene, detailed, tmp_path, share):
+def test_splat_layer_can_be_mixed_in(addon, scene, detailed, tmp_path, share):
     addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node_of(addon, scene).inputs["Splat"].default_value = share
-    own, splat = (
-        made.frozen(6).astype(np.float32).astype(np.float16).astype(np.float64),
-        made.other(6) * made.alpha()[..., None],
+    frame, splat = (
+        make_detail.frozen(6).astype(np.float32).astype(np.float16).astype(np.float64),
+        make_detail.splat_picture(6) * make_detail.alpha()[..., None],
     )
-    assert relative(render(scene, tmp_path)[..., :3], own + share * (splat - own)) < 1e-3
+    assert relative(render(scene, tmp_path)[..., :3], frame + share * (splat - frame)) < 1e-3
 
 
-def test_a_take_of_splats_alone_says_that_it_cannot_tell(addon, scene, shot, layers, tmp_path):
+def test_take_of_splats_only_reports_missing_layers(addon, scene, shot, layers, tmp_path):
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     node = node_of(addon, scene)
     node.inputs["Show What Is Invented"].default_value = 1.0
@@ -303,7 +305,7 @@ def test_a_take_of_splats_alone_says_that_it_cannot_tell(addon, scene, shot, lay
     assert np.abs(render(scene, tmp_path, size=(16, 12)) - layers(6)["rgba"])[..., :3].max() < 1e-6
 
 
-def test_a_group_of_an_older_file_gets_the_new_sockets_and_keeps_its_own(addon, scene, detailed, graded, tmp_path):
+def test_group_of_an_older_file_gains_new_sockets_and_keeps_existing_ones(addon, scene, detailed, graded, tmp_path):
     """A group of version 0.5 lacks the sockets; the artist's links and values are kept."""
     compat = addon("compat")
     addon("bake.insertion").insert_freeze(scene, detailed, "freeze")
@@ -319,7 +321,8 @@ def test_a_group_of_an_older_file_gets_the_new_sockets_and_keeps_its_own(addon, 
     assert {"Plate", "Source"} <= set(node.outputs.keys()) and node.inputs["Only Moving"].default_value == 0.25
     node.inputs["Only Moving"].default_value = 0.0
     assert (
-        relative(render(scene, tmp_path)[..., :3], made.frozen(6).astype(np.float32).astype(np.float16) * GRADE) < 1e-3
+        relative(render(scene, tmp_path)[..., :3], make_detail.frozen(6).astype(np.float32).astype(np.float16) * GRADE)
+        < 1e-3
     )
     assert addon("bake.freeze_group").group_node(compat.compositor_tree(scene)) == node
 
@@ -338,4 +341,4 @@ def test_the_command_line_bakes_a_warp_into_the_artists_file(addon, scene, detai
     assert "has no warp" in capsys.readouterr().err
     assert addon("command_line.headless").main([*words, "--take", "detail", "--first", "6", "--last", "6"]) == 0
     found = read(tmp_path / "out" / "composited" / "000006.exr")[..., :3]
-    assert relative(found, made.frozen(6) * GRADE) < 1e-3
+    assert relative(found, make_detail.frozen(6) * GRADE) < 1e-3

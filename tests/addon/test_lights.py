@@ -92,8 +92,8 @@ def shown(scene, folder: Path, side: int) -> dict[tuple[int, int, int], np.ndarr
 
 
 def test_cycles_shows_every_direction_in_its_colour_and_follows_the_root(scene, shot, lit, addon, tmp_path):
-    told = add(addon, scene, shot)
-    assert "40 %" in told[0]
+    light_facts = add(addon, scene, shot)
+    assert "40 %" in light_facts[0]
     for axis, light in shown(scene, tmp_path, 1).items():
         np.testing.assert_allclose(light, COLORS[axis], atol=0.01, err_msg=str(axis))
     turn = Quaternion((1, 1, 1), 2 * np.pi / 3)  # +X becomes +Y, +Y becomes +Z, +Z becomes +X
@@ -136,19 +136,19 @@ def test_a_world_that_was_chosen_since_stays(scene, shot, lit, addon):
 def test_two_shots_take_turns(scene, shot, lit, addon, contract, tmp_path):
     mine, lights = scene.world, addon("freeze.lights")
     add(addon, scene, shot)
-    other = tmp_path / "other.splannequin"
-    shutil.copytree(shot, other)
-    scene.splannequin.shot_path = str(other)
+    second_shot = tmp_path / "other.splannequin"
+    shutil.copytree(shot, second_shot)
+    scene.splannequin.shot_path = str(second_shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
-    add(addon, scene, other)
-    assert scene.world == lights.find(scene, other) != lights.find(scene, shot)
-    lights.remove(scene, other)
+    add(addon, scene, second_shot)
+    assert scene.world == lights.find(scene, second_shot) != lights.find(scene, shot)
+    lights.remove(scene, second_shot)
     assert scene.world == lights.find(scene, shot)
     lights.remove(scene, shot)
     assert scene.world == mine
 
 
-def test_undo_takes_it_away_and_redo_brings_it_back(scene, shot, lit, addon):
+def test_undo_removes_it_and_redo_restores_it(scene, shot, lit, addon):
     lights, mine = addon("freeze.lights"), scene.world.name
     bpy.ops.ed.undo_push(message="before")
     add(addon, scene, shot)
@@ -174,7 +174,7 @@ def test_it_is_saved_with_the_file(scene, shot, lit, addon, tmp_path):
     assert scene.world is not None and not scene.world.name.endswith("light")
 
 
-def test_the_timer_brings_in_what_a_job_made_in_its_scene_alone(scene, shot, lit, addon):
+def test_timer_inserts_a_job_result_only_into_its_scene(scene, shot, lit, addon):
     job = addon("process.jobs").Job(shot / "jobs" / "x", "light", {})
     job.result = {"take": "freeze", "key": KEY}
     step = addon("process.steps").STEPS["freeze"]
@@ -199,7 +199,7 @@ def test_what_cannot_be_added_is_a_sentence(scene, shot, lit, addon, contract):
     assert scene.world == world and len(bpy.data.worlds) == 1
 
 
-def test_the_button_has_it_made_at_the_cursor(scene, addon, contract, frozen_world):
+def test_button_requests_the_light_at_the_cursor(scene, addon, contract, frozen_world):
     shot = frozen_world / "tiny.splannequin"
     scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), "freeze"
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}

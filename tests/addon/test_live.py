@@ -40,14 +40,14 @@ def test_a_view_through_the_solved_camera_is_the_solved_camera(addon, contract, 
         assert not viewport._same(whole, small)
 
 
-def _answer(session, asked):
+def _answer(session, request):
     """Answer a request as the backend does after drawing a view."""
-    pixels = np.zeros(5 * asked.width * asked.height, np.float32).tobytes()
-    size = {"width": asked.width, "height": asked.height}
-    session._take_in({"kind": "frame", "seq": asked.seq, "t_star": 6, **size}, pixels)
+    pixels = np.zeros(5 * request.width * request.height, np.float32).tobytes()
+    size = {"width": request.width, "height": request.height}
+    session._take_in({"kind": "frame", "seq": request.seq, "t_star": 6, **size}, pixels)
 
 
-def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, contract, shot, monkeypatch):
+def test_resting_view_is_requested_sharper_then_with_plate_detail(addon, contract, shot, monkeypatch):
     """Only one request is open at a time, none while the view changes. Switching detail on or off takes effect at
     once."""
     viewport, live = addon("freeze.viewport"), addon("freeze.live")
@@ -64,8 +64,8 @@ def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, cont
                         for n, f in ((1, 9.0), (2, 18.0)))  # fmt: skip
         sharp.detail = detail
         viewport._ask(1, quick, sharp)
-        asked = session.wanted(1)
-        return None if asked is before else (asked.width, asked.detail)
+        request = session.wanted(1)
+        return None if request is before else (request.width, request.detail)
 
     assert look() == (16, False)
     assert look() is None, "it is still being drawn"
@@ -95,7 +95,7 @@ def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, cont
     assert look(t_star=8.0) is None and session.open, "not asked for over and over"
 
 
-def test_switching_developing_is_asked_for_like_another_view(addon, contract):
+def test_switching_develop_sends_a_new_request(addon, contract):
     views = [contract.LiveView(1, 0, VIEWMAT, [9.0, 9.0, 8.0, 6.0], 16, 12, 6.0, develop=on) for on in (True, False)]
     same = addon("freeze.viewport")._same
     assert same(views[0], views[0]) and not same(*views)
@@ -132,7 +132,7 @@ def test_what_the_backend_warned_of_is_shown_while_it_draws(addon, shot, monkeyp
     assert viewport.note() == "Scrubbing uses the processor."
 
 
-def test_an_orthographic_view_is_not_asked_for(addon, shot, scene):
+def test_orthographic_view_sends_no_request(addon, shot, scene):
     scene.splannequin.shot_path = str(shot)
     assert addon("freeze.viewport").view_of(scene, shot, (64, 48), (Matrix(), Matrix()), 6.0, 10**9) is None
 
@@ -157,7 +157,7 @@ def test_a_session_that_cannot_begin_says_why_and_ends(addon, shot, root):
     assert session._process.wait(20) != 0
 
 
-def _stand_in(tmp_path, name, body):
+def _fake_backend(tmp_path, name, body):
     """Write a program that stands in for the backend's Python, to test a child that would not end by itself."""
     program = tmp_path / name
     program.write_text(f"#!/bin/sh\n{body}\n")
@@ -168,7 +168,7 @@ def _stand_in(tmp_path, name, body):
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
 def test_a_closed_session_leaves_no_process(addon, contract, shot, root, tmp_path):
     live = addon("freeze.live")
-    session = live.open_session(shot, "main", _stand_in(tmp_path, "listens", "exec cat > /dev/null"), root)
+    session = live.open_session(shot, "main", _fake_backend(tmp_path, "listens", "exec cat > /dev/null"), root)
     session.ask(contract.LiveView(1, 0, VIEWMAT, [9.0, 9, 8, 6], 16, 12, 6.0))
     time.sleep(0.2)
     assert session._process.poll() is None
@@ -188,14 +188,14 @@ def test_a_log_that_is_a_link_empties_nothing(addon, contract, shot, root, tmp_p
     log = contract.ShotFolder(shot).live_log
     log.parent.mkdir(exist_ok=True)
     log.symlink_to(theirs)
-    live.open_session(shot, "main", _stand_in(tmp_path, "listens", "exec cat > /dev/null"), root).close()
+    live.open_session(shot, "main", _fake_backend(tmp_path, "listens", "exec cat > /dev/null"), root).close()
     assert theirs.read_text() == "theirs" and not log.is_symlink()
 
 
 def test_a_session_that_hangs_is_ended(addon, shot, root, tmp_path, monkeypatch):
     live = addon("freeze.live")
     monkeypatch.setattr(live, "_PATIENCE_SECONDS", 0.2)
-    session = live.open_session(shot, "main", _stand_in(tmp_path, "hangs", "exec sleep 600"), root)
+    session = live.open_session(shot, "main", _fake_backend(tmp_path, "hangs", "exec sleep 600"), root)
     session.close()
     assert session._process.wait(30) < 0
 

@@ -69,7 +69,7 @@ def test_grain_at_1_is_the_plates_and_another_one_on_every_frame(grainy):
     np.testing.assert_allclose(ratio, 0.5, rtol=0.1)
 
 
-def test_grain_does_not_cover_what_stands_behind(addon, scene, grainy):
+def test_grain_does_not_hide_the_background(addon, scene, grainy):
     node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     node.inputs["CG"].default_value = (0.0, 1.0, 0.0, 1.0)  # far behind, visible where the frame's alpha is 0.5
     grey, half = linear_of(np.float64(grains.VALUE)), grains.WIDTH // 2

@@ -26,15 +26,15 @@ def drawn():
     return mask
 
 
-def test_the_solve_is_asked_for_the_masks_that_are_chosen(addon, contract, scene, shot, tmp_path):
+def test_chosen_masks_reach_the_solve_request(addon, contract, scene, shot, tmp_path):
     props, step = scene.splannequin, addon("process.steps").STEPS["solve"]
     props.shot_path = str(shot)
     props.ignore_from, props.people_from = "FILE", "ALPHA"
     with pytest.raises(contract.JobError, match="Nothing is chosen for the mask Ignore"):
         step.params(scene)
     props.ignore_path = str(tmp_path / "x" / ".." / "logo.png")
-    asked = step.params(scene)
-    assert (asked.ignore_mask, asked.people_mask) == (str(tmp_path / "logo.png"), "alpha")
+    params = step.params(scene)
+    assert (params.ignore_mask, params.people_mask) == (str(tmp_path / "logo.png"), "alpha")
     props.ignore_from = props.people_from = "NONE"
     assert step.params(scene) == contract.SolveParams(ignore_mask="")
     props.people_from = "DRAWN"
@@ -42,7 +42,7 @@ def test_the_solve_is_asked_for_the_masks_that_are_chosen(addon, contract, scene
         step.params(scene)
 
 
-def test_a_focal_length_is_asked_for_as_it_was_typed(addon, contract, scene):
+def test_typed_focal_length_reaches_the_request_unchanged(addon, contract, scene):
     props, step = scene.splannequin, addon("process.steps").STEPS["solve"]
     props.sensor_mm, props.refine_focal = 23.6, False
     assert step.params(scene) == contract.SolveParams(), "without a focal length they say nothing"
@@ -58,9 +58,9 @@ def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file
     (shot / "masks" / "people").mkdir(parents=True)
     (shot / "masks" / "people" / "000099.png").write_bytes(b"of another range")
     before = {kind: len(getattr(bpy.data, kind)) for kind in ("scenes", "objects", "cameras", "node_groups", "images")}
-    asked = addon("process.steps").STEPS["solve"].params(scene)
-    assert Path(asked.people_mask) == shot / "masks" / "people"
-    assert sorted(p.name for p in Path(asked.people_mask).iterdir()) == ["000005.png", "000006.png", "000007.png"]
+    params = addon("process.steps").STEPS["solve"].params(scene)
+    assert Path(params.people_mask) == shot / "masks" / "people"
+    assert sorted(p.name for p in Path(params.people_mask).iterdir()) == ["000005.png", "000006.png", "000007.png"]
     found = read(shot / "masks" / "people" / "000006.png")[..., 0]
     listing = json.loads((shot / "frames" / "frames.json").read_text())
     assert found.shape == (listing["height"], listing["width"])
@@ -82,7 +82,7 @@ def test_a_drawn_masks_values_are_those_of_its_picture(addon, shot, drawn, share
     assert np.allclose(inside, share, atol=0.01) and (found[:, width // 2 :] == 0.0).all()
 
 
-def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_as_it_was(addon, shot, drawn):
+def test_mask_renders_one_frame_per_tick_and_cancel_restores_the_scene(addon, shot, drawn):
     into = shot / "masks" / "people"
     into.mkdir(parents=True)
     (into / "000005.png").write_bytes(b"of before")
@@ -103,9 +103,9 @@ def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_a
 
 def test_what_a_killed_blender_left_of_a_mask_is_removed_by_the_next_one_and_a_living_ones_stays(addon, shot, drawn):
     into, masks = shot / "masks" / "people", addon("solve.drawn_masks")
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         half, ours = (
-            masks._temporary_folder(into, other.pid),
+            masks._temporary_folder(into, process.pid),
             masks._temporary_folder(into.with_name("ignore"), os.getpid()),
         )
         kept = [ours, into.with_name(".people"), into.with_name(".people-1")]
@@ -114,7 +114,7 @@ def test_what_a_killed_blender_left_of_a_mask_is_removed_by_the_next_one_and_a_l
             (folder / "000005.png").write_bytes(b"half of all")
         masks.render(drawn, shot, "people")
         assert (half / "000005.png").is_file(), "it is at work"
-        other.kill()
+        process.kill()
     masks.render(drawn, shot, "people")
     assert sorted(p for p in into.parent.iterdir()) == sorted([*kept, into])
     assert len(list(into.iterdir())) == 3
@@ -194,8 +194,8 @@ def test_a_mask_follows_its_clip_wherever_the_project_lies(addon, scene, shot, t
     named = "/old/place/plates/take.1001.png" if how == "moved" else str(plates / "take.1001.png")
     info, listing = shot / "shot.json", shot / "frames" / "frames.json"
     info.write_text(json.dumps({**json.loads(info.read_text()), "source": named}))
-    beside = os.path.relpath(plates / "take.1001.png", shot)
-    listing.write_text(json.dumps({**json.loads(listing.read_text()), "beside": beside}))
+    relative_path = os.path.relpath(plates / "take.1001.png", shot)
+    listing.write_text(json.dumps({**json.loads(listing.read_text()), "beside": relative_path}))
     opened = plates / "take.1001.png"
     if how == "linked":
         (tmp_path / "link").symlink_to(tmp_path / "project")
@@ -204,7 +204,7 @@ def test_a_mask_follows_its_clip_wherever_the_project_lies(addon, scene, shot, t
     assert addon("solve.drawn_masks")._shift(addon("solve.drawn_masks").contract.ShotFolder(shot)) == -1000
 
 
-def test_a_mask_follows_its_clip_in_a_shot_that_counts_from_a_start_of_its_own(addon, shot, tmp_path, pictures):
+def test_mask_follows_its_clip_in_a_shot_with_a_start_frame(addon, shot, tmp_path, pictures):
     """File 0005 is frame 1005 of the shot. A clip that starts there shows it at scene frame 1."""
     for number in (5, 6):
         pictures.write(tmp_path / f"take.{number:04d}.png", np.zeros((12, 16, 3), np.uint8))

@@ -69,7 +69,7 @@ def test_the_mattes_are_shown_as_a_sequence(matted):
     assert os.path.abspath(bpy.path.abspath(image.filepath)) == str(matted / "solve" / "motion" / "000005.png")
 
 
-def test_what_is_painted_lands_in_the_shot_and_only_there(matted, addon):
+def test_paint_is_saved_only_in_the_shot(matted, addon):
     mattes = addon("solve.mattes")
     found = {p: p.read_bytes() for p in (matted / "solve" / "motion").iterdir()}
     assert bpy.ops.splannequin.paint_motion() == {"FINISHED"}
@@ -131,7 +131,7 @@ def test_refusals_are_sentences(matted, scene):
         bpy.ops.splannequin.show_motion()
 
 
-def test_paint_that_announces_too_many_pixels_is_not_loaded(matted, scene):
+def test_oversized_paint_is_not_loaded(matted, scene):
     content = bytearray(png(np.zeros((4, 4), np.uint8)))
     content[16:24] = struct.pack(">II", 16000, 16000)
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
@@ -141,7 +141,7 @@ def test_paint_that_announces_too_many_pixels_is_not_loaded(matted, scene):
         bpy.ops.splannequin.paint_motion()
 
 
-def test_buttons_are_off_without_a_solve(scene, tmp_path):
+def test_buttons_are_disabled_without_a_solve(scene, tmp_path):
     assert not bpy.ops.splannequin.paint_motion.poll()
 
 

@@ -69,7 +69,7 @@ def wall(scene):
     return camera
 
 
-def test_the_mean_over_the_shutter_is_cycles_own_motion_blur(scene, wall, root, tmp_path):
+def test_mean_over_the_shutter_matches_cycles_motion_blur(scene, wall, root, tmp_path):
     python = os.environ.get("SPLANNEQUIN_BACKEND_PYTHON")
     if not python:
         pytest.skip("no backend to ask: SPLANNEQUIN_BACKEND_PYTHON names its Python")
@@ -79,9 +79,9 @@ def test_the_mean_over_the_shutter_is_cycles_own_motion_blur(scene, wall, root, 
         seen = wall.evaluated_get(bpy.context.evaluated_depsgraph_get())
         viewmat = [value for row in FLIP @ seen.matrix_world.inverted() for value in row]
         frames.append({"frame": number, "viewmat": viewmat, "K": [focal, focal, SIZE[0] / 2, SIZE[1] / 2]})
-    told = {"version": 1, "width": SIZE[0], "height": SIZE[1], "frames": frames}
+    camera_path = {"version": 1, "width": SIZE[0], "height": SIZE[1], "frames": frames}
     path, out = tmp_path / "path.json", tmp_path / "poses.json"
-    path.write_text(json.dumps(told))
+    path.write_text(json.dumps(camera_path))
     words = [python, str(DATA / "sub_poses.py"), str(root), str(path), str(MIDDLE), str(DEPTH), str(out)]
     subprocess.run(words, check=True, timeout=300)
     scene.frame_set(MIDDLE)

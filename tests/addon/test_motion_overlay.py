@@ -29,7 +29,7 @@ def frames(addon, shot):
     return found
 
 
-def test_it_is_tinted_where_something_moves_and_clear_where_the_plate_stands_still(addon, scene, loaded):
+def test_overlay_tints_moving_pixels_only(addon, scene, loaded):
     toggle()
     camera = addon("solve.cameras").find(scene, loaded, "CAMERA").data
     plate, overlay = camera.background_images
@@ -75,7 +75,7 @@ def test_what_was_painted_since_is_tinted_anew(addon, loaded):
     assert changed == {"000006.png"} and (frames(addon, loaded)[6][..., 3] > 100).all()
 
 
-def test_another_solve_and_removing_the_shot_take_it_away(addon, scene, loaded):
+def test_new_solve_or_shot_removal_removes_the_overlay(addon, scene, loaded):
     overlay = addon("solve.motion_overlay")
     toggle()
     addon("solve.arrival").load_camera(scene, loaded)
@@ -85,16 +85,16 @@ def test_another_solve_and_removing_the_shot_take_it_away(addon, scene, loaded):
     assert not [i for i in bpy.data.images if "Motion over" in i.name]
 
 
-def test_without_mattes_or_camera_it_says_so(addon, scene, shot):
+def test_missing_mattes_or_camera_are_reported(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
     with pytest.raises(RuntimeError, match="no motion matte"):
         bpy.ops.splannequin.motion_over_plate()
 
 
 def test_nothing_is_written_through_a_link(addon, scene, loaded, tmp_path):
-    motion, elsewhere = loaded / "solve" / "motion", tmp_path / "elsewhere"
-    motion.rename(elsewhere)
-    motion.symlink_to(elsewhere, target_is_directory=True)
+    motion, target = loaded / "solve" / "motion", tmp_path / "elsewhere"
+    motion.rename(target)
+    motion.symlink_to(target, target_is_directory=True)
     with pytest.raises(RuntimeError, match="Cannot write"):
         bpy.ops.splannequin.motion_over_plate()
-    assert not (elsewhere / "overlay").exists()
+    assert not (target / "overlay").exists()

@@ -30,15 +30,15 @@ def found(addon, scene, world, name):
     return check.waited(check.checking(scene, world, name)).shares
 
 
-def test_near_the_clips_path_little_is_a_guess_and_turned_away_all_of_it_is(addon, scene, world, move):
+def test_guessed_share_is_small_near_the_path_and_full_when_turned_away(addon, scene, world, move):
     scene.frame_set(103)
     shares = found(addon, scene, world, move.name)
     assert list(shares) == list(range(101, 117)) and scene.frame_current == 103
     assert np.mean(list(shares.values())) < 0.3
-    away = bpy.data.objects.new("away", move.data)
-    scene.collection.objects.link(away)
+    turned_camera = bpy.data.objects.new("away", move.data)
+    scene.collection.objects.link(turned_camera)
     scene.frame_set(105)
-    away.matrix_world = move.matrix_world @ Matrix.Rotation(np.pi, 4, "Y")
+    turned_camera.matrix_world = move.matrix_world @ Matrix.Rotation(np.pi, 4, "Y")
     bpy.context.view_layer.update()
     assert min(found(addon, scene, world, "away").values()) > 0.95
 
@@ -53,7 +53,7 @@ def test_the_operator_says_it_and_leaves_the_scene_as_it_is(addon, scene, world,
     assert not bpy.ops.splannequin.check_move.poll()
 
 
-def test_of_a_long_move_every_so_many_frames_are_looked_at(addon, scene, world, move):
+def test_long_move_is_checked_at_sampled_frames(addon, scene, world, move):
     scene.frame_start, scene.frame_end = 101, 301
     shares = found(addon, scene, world, move.name)
     assert len(shares) <= addon("freeze.move_check").MOST_FRAMES + 1

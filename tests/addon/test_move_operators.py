@@ -18,13 +18,13 @@ def shaky(addon, scene, shot):
 
 
 def with_walk(addon, scene, shot, seed=0):
-    told = json.loads((shot / "solve" / "cameras.json").read_text())
+    cameras = json.loads((shot / "solve" / "cameras.json").read_text())
     rng, frames = np.random.default_rng(seed), []
     for n in range(FIRST, LAST + 1):
         viewmat = np.eye(4)
         viewmat[:3, 3] = np.array([-0.05 * (n - 25), 0.1, 4.0]) + 0.02 * rng.normal(size=3)
         frames.append({"frame": n, "viewmat": viewmat.ravel().tolist(), "K": [*[20.0 + 0.1 * n] * 2, 9.0, 5.0]})
-    (shot / "solve" / "cameras.json").write_text(json.dumps({**told, "frames": frames}))
+    (shot / "solve" / "cameras.json").write_text(json.dumps({**cameras, "frames": frames}))
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
     addon("solve.arrival").load_camera(scene, shot)
@@ -46,15 +46,15 @@ def path_read(addon, scene, shot):
             return end.value
 
 
-def test_smooth_at_0_is_the_clips_own_path(addon, contract, scene, shaky):
+def test_zero_smoothing_keeps_the_clip_path(addon, contract, scene, shaky):
     assert bpy.ops.splannequin.move_smooth(position=0.0, rotation=0.0) == {"FINISHED"}
     camera = scene.splannequin.path_camera
     assert camera.name.endswith(" smooth") and camera.parent == addon("solve.cameras").find(scene, shaky, "EMPTY")
     found, want = path_read(addon, scene, shaky), contract.CameraPath.load(shaky / "solve" / "cameras.json")
     assert [f.frame for f in found.frames] == list(range(FIRST, LAST + 1))
-    for one, other in zip(found.frames, want.frames, strict=True):
-        np.testing.assert_allclose(one.viewmat, other.viewmat, atol=1e-4)
-        np.testing.assert_allclose(one.K, other.K, rtol=1e-4)
+    for one, expected in zip(found.frames, want.frames, strict=True):
+        np.testing.assert_allclose(one.viewmat, expected.viewmat, atol=1e-4)
+        np.testing.assert_allclose(one.K, expected.K, rtol=1e-4)
 
 
 def test_smooth_at_1_leaves_a_tenth_of_the_second_difference(addon, contract, scene, shaky):
@@ -135,7 +135,7 @@ def test_orbit_leaves_the_path_around_the_middle_and_comes_back(addon, scene, sh
         assert moved[2] == pytest.approx(0.0, abs=1e-4), "it swings around the scene's upward axis"
 
 
-def test_the_takes_depth_is_asked_first_and_then_the_points(addon, scene, shaky):
+def test_middle_depth_comes_from_the_take_before_the_points(addon, scene, shaky):
     operators = addon("freeze.move_operators")
     path = operators.clip_path(shaky)
     z = addon("freeze.middle_depth").of_frame(shaky / "takes" / "freeze" / "000006.exr")
@@ -187,6 +187,6 @@ def test_two_shots_each_keep_their_move(addon, scene, shaky, tmp_path):
     assert scene.splannequin.path_camera == second
 
 
-def test_without_the_solve_in_the_scene_there_is_no_move(scene, shot):
+def test_move_needs_the_solve_in_the_scene(scene, shot):
     scene.splannequin.shot_path = str(shot)
     assert not bpy.ops.splannequin.move_smooth.poll()

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 import pytest
 
-from tests.addon.data import make_detail as made
+from tests.addon.data import make_detail
 from tests.addon.data import make_shoulder as shoulder
 from tests.addon.data.pixels import read
 
@@ -93,48 +93,48 @@ def blender(config: Path | str, root: Path, shot: Path, out: Path, script: str =
         timeout=120,
         check=False,
     )
-    told = done.stdout + done.stderr
-    if str(config).startswith("ocio://") and f"could not read '{config}'" in told:
+    printed = done.stdout + done.stderr
+    if str(config).startswith("ocio://") and f"could not read '{config}'" in printed:
         pytest.skip("this Blender's OpenColorIO has no configurations built in: it is older than 2.2")
-    assert (out / "told.json").is_file(), told
+    assert (out / "told.json").is_file(), printed
     return json.loads((out / "told.json").read_text())
 
 
 def test_camera_and_take_come_in_whole_under_an_aces_configuration(root, shot, tmp_path, pictures, layers):
     """The names are those of the ACES studio configuration. Pixels pass through ACEScg unchanged."""
     config = configuration(tmp_path, "Linear Rec.709 (sRGB)", "sRGB Encoded Rec.709 (sRGB)")
-    told = blender(config, root, shot, tmp_path)
-    assert "my shot é camera is the scene's camera, with the plate behind it." in told["first"]["said"]
+    result = blender(config, root, shot, tmp_path)
+    assert "my shot é camera is the scene's camera, with the plate behind it." in result["first"]["said"]
     said = "View transform set from Raw to Un-tone-mapped, so that the plate keeps its colours."
-    assert said in told["freeze"]["said"]
-    assert "said" in told["combined"]
+    assert said in result["freeze"]["said"]
+    assert "said" in result["combined"]
     plate = pictures.read(tmp_path / "plate" / "000006.png")
     assert np.abs(plate - pictures.read(shot / "frames" / "000006.png")).max() * 255 < 1.1
     frozen = pictures.read(tmp_path / "frozen" / "000006.png")
     expected = pictures.srgb(layers(6)["rgba"][..., :3])
     assert np.abs(frozen - expected)[:, 1:].max() * 255 < 1.6
-    assert not told["end"]["made"] and not told["end"]["own"] and told["end"]["colours"][0] == "Raw"
+    assert not result["end"]["made"] and not result["end"]["own"] and result["end"]["colours"][0] == "Raw"
 
 
 def test_colour_spaces_are_known_by_what_they_do(root, shot, tmp_path):
-    told = blender(configuration(tmp_path, "Licht", "Bildschirm"), root, shot, tmp_path)
-    assert "said" in told["first"] and "said" in told["freeze"]
+    result = blender(configuration(tmp_path, "Licht", "Bildschirm"), root, shot, tmp_path)
+    assert "said" in result["first"] and "said" in result["freeze"]
 
 
-def test_where_nothing_fits_a_sentence_says_so_and_the_scene_stays_as_it_was(root, shot, tmp_path):
+def test_unmatched_colour_space_is_reported_and_changes_nothing(root, shot, tmp_path):
     text = CONFIG.format(paint="ACEScg", view="Film", display="REC.1886-REC.709")
     (tmp_path / "config.ocio").write_text(text)
-    told = blender(tmp_path / "config.ocio", root, shot, tmp_path)
+    result = blender(tmp_path / "config.ocio", root, shot, tmp_path)
     for step in ("first", "again"):
-        assert told[step]["error"] == (
+        assert result[step]["error"] == (
             "Blender's OCIO colour configuration has no colour space for sRGB. "
             "Start Blender without this configuration, or add the colour space to it."
         )
-        assert told[step]["changed"] == {}, f"{step}: a build that failed left something behind"
-    assert told["without a plate"]["changed"]["made"] == [[], ["my shot é"]]
-    assert "no view that keeps colours unchanged" in told["freeze"]["error"] and told["freeze"]["changed"] == {}
-    assert "no colour space for scene-linear Rec.709" in told["as they come"]["error"]
-    assert told["as they come"]["changed"] == {}
+        assert result[step]["changed"] == {}, f"{step}: a build that failed left something behind"
+    assert result["without a plate"]["changed"]["made"] == [[], ["my shot é"]]
+    assert "no view that keeps colours unchanged" in result["freeze"]["error"] and result["freeze"]["changed"] == {}
+    assert "no colour space for scene-linear Rec.709" in result["as they come"]["error"]
+    assert result["as they come"]["changed"] == {}
 
 
 CG_CONFIG = "ocio://cg-config-v2.1.0_aces-v1.3_ocio-v2.3"
@@ -160,7 +160,7 @@ def light(path):
     return read(path)[..., :3]
 
 
-def off(found, expected):
+def relative_error(found, expected):
     """Largest pixel error relative to the pixel's brightest channel (at least 0.01)."""
     return float((np.abs(found - expected).max(-1) / np.maximum(np.abs(expected).max(-1), 0.01)).max())
 
@@ -168,42 +168,42 @@ def off(found, expected):
 def test_light_passes_an_aces_scene_within_a_thousandth(root, shot, tmp_path):
     """Rec.709 values from -0.2 to 50 through ACEScg, for the plate, the take's frames, and the plate frozen by its
     warp."""
-    told = blender(CG_CONFIG, root, with_detail(shot, [0.78125, 0.390625, 0.1953125]), tmp_path, "in_aces")
-    assert any("000005.exr is used as the plate" in line for line in told["said"])
-    half = made.frozen(6).astype(np.float32).astype(np.float16)
-    for name, expected in (("plate", made.plate(6)), ("frozen", half), ("warp", made.frozen(6))):
-        assert off(light(tmp_path / f"{name}.exr"), expected @ TO_AP1.T) < 1e-3, name
+    result = blender(CG_CONFIG, root, with_detail(shot, [0.78125, 0.390625, 0.1953125]), tmp_path, "in_aces")
+    assert any("000005.exr is used as the plate" in line for line in result["said"])
+    half = make_detail.frozen(6).astype(np.float32).astype(np.float16)
+    for name, expected in (("plate", make_detail.plate(6)), ("frozen", half), ("warp", make_detail.frozen(6))):
+        assert relative_error(light(tmp_path / f"{name}.exr"), expected @ TO_AP1.T) < 1e-3, name
 
 
 def test_working_frames_with_a_shoulder_give_their_light_to_an_aces_scene(root, shot, tmp_path):
     """The shoulder applies to Rec.709 channels, so light of up to 60 is converted from the scene's space and back."""
-    told_of = with_detail(shot, [0.78125, 0.390625, 0.1953125]) / "takes" / "detail" / "take.json"
-    facts = json.loads(told_of.read_text())
+    take_file = with_detail(shot, [0.78125, 0.390625, 0.1953125]) / "takes" / "detail" / "take.json"
+    facts = json.loads(take_file.read_text())
     facts["footage"]["unlike"] = "its pixels are not square"
-    told_of.write_text(json.dumps(facts))
+    take_file.write_text(json.dumps(facts))
     expected = shoulder.light(56, 42)
     for frame in (5, 6):
         shoulder.write(shot / "frames" / f"{frame:06d}.png", expected)
     listing = shot / "frames" / "frames.json"
     listing.write_text(json.dumps({**json.loads(listing.read_text()), "display": "shoulder"}))
-    told = blender(CG_CONFIG, root, shot, tmp_path, "in_aces")
-    assert any("shows working frames as the plate" in line for line in told["said"])
+    result = blender(CG_CONFIG, root, shot, tmp_path, "in_aces")
+    assert any("shows working frames as the plate" in line for line in result["said"])
     # One 16-bit step at the end of the shoulder is 8e-4 of light; Blender 4.2 has errors of some steps.
-    assert off(light(tmp_path / "plate.exr"), expected @ TO_AP1.T) < 5e-3
+    assert relative_error(light(tmp_path / "plate.exr"), expected @ TO_AP1.T) < 5e-3
 
 
 def test_an_acescg_plate_passes_an_aces_scene_bit_for_bit(root, shot, tmp_path):
     probe = np.linalg.inv(TO_AP1) @ [0.78125, 0.390625, 0.1953125]
     blender(CG_CONFIG, root, with_detail(shot, probe.tolist()), tmp_path, "in_aces")
-    assert np.array_equal(light(tmp_path / "plate.exr"), made.plate(6))
+    assert np.array_equal(light(tmp_path / "plate.exr"), make_detail.plate(6))
 
 
 def test_camera_and_take_come_in_whole_under_the_cg_configuration(root, shot, tmp_path, pictures, layers):
-    told = blender(CG_CONFIG, root, shot, tmp_path)
-    assert "my shot é camera is the scene's camera, with the plate behind it." in told["first"]["said"]
-    assert any("to Un-tone-mapped, so that the plate keeps its colours" in line for line in told["freeze"]["said"])
+    result = blender(CG_CONFIG, root, shot, tmp_path)
+    assert "my shot é camera is the scene's camera, with the plate behind it." in result["first"]["said"]
+    assert any("to Un-tone-mapped, so that the plate keeps its colours" in line for line in result["freeze"]["said"])
     plate = pictures.read(tmp_path / "plate" / "000006.png")
     assert np.abs(plate - pictures.read(shot / "frames" / "000006.png")).max() * 255 < 1.1
     frozen = pictures.read(tmp_path / "frozen" / "000006.png")
     assert np.abs(frozen - pictures.srgb(layers(6)["rgba"][..., :3]))[:, 1:].max() * 255 < 1.6
-    assert not told["end"]["made"] and not told["end"]["own"] and "ACES" in told["end"]["colours"][0]
+    assert not result["end"]["made"] and not result["end"]["own"] and "ACES" in result["end"]["colours"][0]

@@ -8,13 +8,12 @@ import bpy
 import numpy as np
 import pytest
 
-from tests.addon.data import make_detail as made
+from tests.addon.data import make_detail, pixels
 from tests.addon.data import make_levels as levels
 from tests.addon.data import make_shoulder as shoulder
-from tests.addon.data import pixels
 
 DATA = Path(__file__).resolve().parent / "data"
-SIZE = made.WIDTH, made.HEIGHT
+SIZE = make_detail.WIDTH, make_detail.HEIGHT
 SRGB = tuple(float(((v + 0.055) / 1.055) ** 2.4) for v in (0.78125, 0.390625, 0.1953125))
 LINEAR = (0.78125, 0.390625, 0.1953125)
 
@@ -28,25 +27,25 @@ def footage(scene, shot, tmp_path):
     shutil.copytree(DATA / "detail", take, ignore=shutil.ignore_patterns("plate"))
     scene.render.resolution_x, scene.render.resolution_y = SIZE
 
-    def tell(**told):
+    def write_take(**changes):
         facts = {"version": 1, "take": "detail", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 2}
         facts |= {"width": SIZE[0], "height": SIZE[1], "first": 5, "last": 6, "camera_path": ""}
         facts["footage"] = {
             "file": str(folder / "000005.exr"), "beside": "../the plate/000005.exr", "size": list(SIZE), "first": 5,
-            "last": 6, "probe": list(LINEAR), "space": "linear, Rec.709", "map": "", "unlike": "", **told,
+            "last": 6, "probe": list(LINEAR), "space": "linear, Rec.709", "map": "", "unlike": "", **changes,
         }  # fmt: skip
         (take / "take.json").write_text(json.dumps(facts))
         return shot
 
-    return tell
+    return write_take
 
 
 def node_of(addon, scene):
     return addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
 
 
-def render(*asked):
-    return pixels.render(*asked)[..., :3]
+def render(*args):
+    return pixels.render(*args)[..., :3]
 
 
 def st_map(path: Path, places: np.ndarray) -> None:
@@ -70,7 +69,7 @@ def test_mix_0_is_the_footage_bit_for_bit_and_no_copy_is_shown(addon, scene, foo
     assert [path.suffix for path in shown] == [".exr"] and "the plate" in str(shown[0])
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
     for frame in (5, 6):
-        assert np.array_equal(render(scene, tmp_path, frame), made.plate(frame))
+        assert np.array_equal(render(scene, tmp_path, frame), make_detail.plate(frame))
 
 
 @pytest.mark.parametrize("shift", [4, -90])
@@ -88,7 +87,7 @@ def test_footage_that_the_shot_numbers_otherwise_is_shown_at_the_shots_frames(ad
     assert any("is used as the plate, 56 x 42." in line for line in said)
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
     for frame in (5, 6):
-        assert np.array_equal(render(scene, tmp_path, frame), made.plate(frame))
+        assert np.array_equal(render(scene, tmp_path, frame), make_detail.plate(frame))
 
 
 def test_acescg_footage_is_brought_to_the_scenes_light(addon, scene, footage, tmp_path):
@@ -97,33 +96,33 @@ def test_acescg_footage_is_brought_to_the_scenes_light(addon, scene, footage, tm
     said = addon("bake.insertion").insert_freeze(scene, footage(probe=(matrix @ LINEAR).tolist()), "detail")
     assert "The footage 000005.exr is used as the plate, 56 x 42." in said
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
-    found, expected = render(scene, tmp_path, 6), made.plate(6) @ matrix.T
+    found, expected = render(scene, tmp_path, 6), make_detail.plate(6) @ matrix.T
     assert float((np.abs(found - expected).max(-1) / np.abs(expected).max(-1)).max()) < 1e-3
 
 
 def test_the_freeze_as_a_warp_works_on_the_footage_itself(addon, scene, footage, tmp_path):
     """Values from -0.2 to 50, which a PNG cannot store."""
     addon("bake.insertion").insert_freeze(scene, footage(), "detail", warp=True)
-    found, delivered = render(scene, tmp_path, 6), made.frozen(6)
+    found, delivered = render(scene, tmp_path, 6), make_detail.frozen(6)
     assert delivered.max() > 40
     assert float((np.abs(found - delivered) / np.maximum(np.abs(delivered), 0.01)).max()) < 1e-3
 
 
-def test_its_lens_is_taken_away_by_the_takes_map(addon, scene, footage, tmp_path):
+def test_take_map_undistorts_the_plate(addon, scene, footage, tmp_path):
     shot = footage(map="stmap/undistort.exr")
-    st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(6))
+    st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", make_detail.places(6))
     said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
     assert "The footage 000005.exr is used as the plate, 56 x 42, undistorted by the take's ST map." in said
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
-    found, expected = render(scene, tmp_path, 6), made.moved(made.plate(6), 6)
+    found, expected = render(scene, tmp_path, 6), make_detail.moved(make_detail.plate(6), 6)
     assert float((np.abs(found - expected) / np.maximum(np.abs(expected), 0.05)).max()) < 2e-3
 
 
-def test_bakes_replace_each_other_and_leave_nothing(addon, scene, footage):
+def test_new_bake_replaces_the_old_without_leftovers(addon, scene, footage):
     shot = footage(map="stmap/undistort.exr")
     kinds = ("images", "node_groups", "textures")
     before = {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds}
-    st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(6))
+    st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", make_detail.places(6))
     bake = addon("bake.insertion")
     bake.insert_freeze(scene, shot, "detail")
     once = {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds}
@@ -139,7 +138,7 @@ def test_bakes_replace_each_other_and_leave_nothing(addon, scene, footage):
     assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == before
 
 
-def test_what_is_read_ahead_is_the_footage(addon, scene, footage):
+def test_prefetch_reads_the_footage(addon, scene, footage):
     bake, shot = addon("bake.insertion"), footage()
     assert len(list(bake.prefetch(scene, shot, "detail"))) == 2
     bake.insert(scene, shot, "detail")
@@ -147,26 +146,26 @@ def test_what_is_read_ahead_is_the_footage(addon, scene, footage):
     assert [i.name for i in bpy.data.images if i.name.startswith("Plate")] == ["Plate 000005"]
 
 
-def test_the_map_of_the_lens_is_read_ahead_and_again_if_it_has_changed(addon, scene, footage, tmp_path):
+def test_lens_map_is_prefetched_and_reread_after_a_change(addon, scene, footage, tmp_path):
     """Reading a map blocks Blender's window, so each map has its own turn. The first bake here is never inserted."""
     bake, shot = addon("bake.insertion"), footage(map="stmap/undistort.exr")
     for frame in (5, 6):
-        st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(frame))
+        st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", make_detail.places(frame))
         assert len(list(bake.prefetch(scene, shot, "detail"))) == 3
     read = next(image for image in bpy.data.images if image.name.startswith("Plate"))
     assert read.alpha_mode == "NONE", "to be set while it is inserted it would be read once more"
     bake.insert(scene, shot, "detail")
     assert not addon("scene.sequences")._prefetched, "they are taken as they were read"
     node_of(addon, scene).inputs["Mix"].default_value = 0.0
-    found, expected = render(scene, tmp_path, 6), made.moved(made.plate(6), 6)
+    found, expected = render(scene, tmp_path, 6), make_detail.moved(make_detail.plate(6), 6)
     assert float((np.abs(found - expected) / np.maximum(np.abs(expected), 0.05)).max()) < 2e-3
 
 
 def test_a_video_shows_frame_n_at_frame_n(addon, scene, footage, tmp_path):
     """Frame n shows the n-th picture, with the brightness of its luma."""
     size = levels.WIDTH, levels.HEIGHT
-    told = {"file": str(DATA / "levels.mp4"), "size": list(size), "first": 1, "last": levels.FRAMES}
-    shot = footage(**told, probe=list(SRGB), space="video, Rec.709")
+    footage_facts = {"file": str(DATA / "levels.mp4"), "size": list(size), "first": 1, "last": levels.FRAMES}
+    shot = footage(**footage_facts, probe=list(SRGB), space="video, Rec.709")
     scene.render.resolution_x, scene.render.resolution_y = size
     said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
     assert "The footage levels.mp4 is used as the plate, 64 x 48." in said
@@ -178,16 +177,20 @@ def test_a_video_shows_frame_n_at_frame_n(addon, scene, footage, tmp_path):
 
 
 @pytest.mark.parametrize("code, rows", [(3, (-1, 0, 0, 0, -1, 0)), (6, (0, 1, 0, -1, 0, 0)), (8, (0, -1, 0, 1, 0, 0))])
-def test_a_turned_video_is_the_plate_where_blender_turns_it_and_working_frames_elsewhere(
-    addon, scene, footage, tmp_path, code, rows
-):
+def test_rotated_video_is_used_where_blender_rotates_it(addon, scene, footage, tmp_path, code, rows):
     data = bytearray((DATA / "levels.mp4").read_bytes())
     at = data.find(b"tkhd") + 44
     data[at : at + 24] = np.array([65536 * value for value in rows], ">i4").tobytes()
     (tmp_path / "turned.mp4").write_bytes(bytes(data))
     size = [levels.WIDTH, levels.HEIGHT] if code == 3 else [levels.HEIGHT, levels.WIDTH]
-    told = {"file": str(tmp_path / "turned.mp4"), "size": size, "first": 1, "last": levels.FRAMES, "orientation": code}
-    said = addon("bake.insertion").insert_freeze(scene, footage(**told, probe=list(SRGB)), "detail")
+    footage_facts = {
+        "file": str(tmp_path / "turned.mp4"),
+        "size": size,
+        "first": 1,
+        "last": levels.FRAMES,
+        "orientation": code,
+    }
+    said = addon("bake.insertion").insert_freeze(scene, footage(**footage_facts, probe=list(SRGB)), "detail")
     turns = addon("compat").TURNS_VIDEOS
     image = bpy.data.images.load(str(tmp_path / "turned.mp4"))
     if code != 3:
@@ -197,7 +200,7 @@ def test_a_turned_video_is_the_plate_where_blender_turns_it_and_working_frames_e
 
 
 @pytest.mark.parametrize(
-    "told, why",
+    "changes, why",
     [
         ({"unlike": "its pixels are not square"}, "000005.exr: its pixels are not square"),
         ({"file": "/nowhere/a.0001.exr", "beside": ""}, "a.0001.exr no longer exists"),
@@ -209,8 +212,8 @@ def test_a_turned_video_is_the_plate_where_blender_turns_it_and_working_frames_e
         ({"map": "stmap/undistort.exr"}, "the take's ST map no longer exists"),
     ],
 )
-def test_working_frames_stand_in_and_a_sentence_says_why(addon, scene, footage, told, why):
-    said = addon("bake.insertion").insert_freeze(scene, footage(**told), "detail")
+def test_working_frames_replace_unusable_footage_with_a_reason(addon, scene, footage, changes, why):
+    said = addon("bake.insertion").insert_freeze(scene, footage(**changes), "detail")
     assert f"The compositor shows working frames as the plate, not the footage: {why}." in said
     shown = [image for image in bpy.data.images if image.name.startswith("Plate")]
     assert len(shown) == 1 and shown[0].filepath.endswith(".png")
@@ -271,12 +274,12 @@ def test_frames_and_warps_of_acescg_footage_are_read_in_their_light(addon, scene
         stale.unlink()
     bake.insert_freeze(scene, shot, "detail", warp=warp)
     for _ in range(2):
-        found, expected = render(scene, tmp_path, 6), made.frozen(6)
+        found, expected = render(scene, tmp_path, 6), make_detail.frozen(6)
         assert float((np.abs(found - expected).max(-1) / np.maximum(np.abs(expected).max(-1), 0.01)).max()) < 1e-3
         bake.insert_freeze(scene, shot, "detail", warp=warp)
 
 
-def test_working_frames_that_stand_in_have_the_highlights_of_their_shoulder(addon, contract, scene, footage, tmp_path):
+def test_working_frames_restore_highlights_from_their_shoulder(addon, contract, scene, footage, tmp_path):
     """Light up to 60 is recovered by the compositor. If the record has no shoulder, the frames are read as sRGB."""
     shot = footage(unlike="its pixels are not square")
     light = shoulder.light(*SIZE)

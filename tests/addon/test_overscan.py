@@ -78,9 +78,9 @@ def test_the_artists_stream_and_the_mattes_fall_on_the_same_pixels(addon, scene,
     tree = compat.new_compositor_tree(scene, "Artist")
     stream = tree.nodes.new("CompositorNodeImage")
     stream.image = bpy.data.images.new("stream", 12, 10, float_buffer=True, is_data=True)
-    own = np.random.default_rng(5).uniform(0.1, 0.9, (10, 12, 4)).astype(np.float32)
-    own[..., 3] = 1.0
-    stream.image.pixels.foreach_set(own[::-1].ravel())
+    painted = np.random.default_rng(5).uniform(0.1, 0.9, (10, 12, 4)).astype(np.float32)
+    painted[..., 3] = 1.0
+    stream.image.pixels.foreach_set(painted[::-1].ravel())
     tree.links.new(stream.outputs["Image"], compat.output_socket(tree))
     compositor.insert(scene, take)
     group = addon("bake.freeze_group").group_node(tree)
@@ -88,7 +88,7 @@ def test_the_artists_stream_and_the_mattes_fall_on_the_same_pixels(addon, scene,
     group.inputs["Wipe"].default_value = 0.5
     found = pictures.read(render(addon, scene, tmp_path))
     share = inside(layers(6)["support"])[..., None] * (np.arange(12) < 6)[None, :, None]
-    expected = own[..., :3] + share * (inside(layers(6)["rgba"])[..., :3] - own[..., :3])
+    expected = painted[..., :3] + share * (inside(layers(6)["rgba"])[..., :3] - painted[..., :3])
     assert np.abs(found - pictures.srgb(expected)).max() * 255 < 1.1
 
 
@@ -207,10 +207,10 @@ def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_s
     operators, supervisor = addon("solve.operators"), addon("process.job_timer")
     watch = supervisor.watch_of(lens_shot)
     scene.splannequin.shot_path = str(lens_shot)
-    asked = addon("solve.stmaps").begin(lens_shot)
-    operators.follow_stmaps(lens_shot, asked)
+    question = addon("solve.stmaps").begin(lens_shot)
+    operators.follow_stmaps(lens_shot, question)
     assert not bpy.ops.splannequin.write_stmaps.poll(), "one at a time"
-    asked.process.wait(60)
+    question.process.wait(60)
     for _ in range(100):  # a turn has a time budget, and a thread reads the process's output
         supervisor.tick()
         if not operators.writing:
@@ -221,7 +221,7 @@ def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_s
     assert bpy.ops.splannequin.write_stmaps.poll()
 
 
-def test_without_a_solve_the_button_is_off(addon, scene, tmp_path):
+def test_overscan_button_is_disabled_without_a_solve(addon, scene, tmp_path):
     scene.splannequin.shot_path = str(tmp_path / "none.splannequin")
     assert not bpy.ops.splannequin.write_stmaps.poll()
 

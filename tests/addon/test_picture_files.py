@@ -18,7 +18,7 @@ def media(settings, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", PICTURES)
-def test_a_cut_off_picture_is_told_from_a_whole_one(addon, scene, tmp_path, kind):
+def test_truncated_picture_is_detected(addon, scene, tmp_path, kind):
     noise = bpy.data.images.new("noise", 96, 64)
     noise.pixels.foreach_set([(7919 * n % 1009) / 1009 for n in range(96 * 64 * 4)])
     settings = scene.render.image_settings
@@ -40,7 +40,7 @@ def test_a_cut_off_picture_is_told_from_a_whole_one(addon, scene, tmp_path, kind
 
 
 @pytest.mark.parametrize("container", MOVIES)
-def test_a_cut_off_movie_is_told_from_a_whole_one(addon, scene, tmp_path, container):
+def test_truncated_movie_is_detected(addon, scene, tmp_path, container):
     media(scene.render.image_settings, "VIDEO")
     scene.render.image_settings.file_format = "FFMPEG"
     scene.render.ffmpeg.format, scene.render.ffmpeg.codec = container, MOVIES[container]
@@ -56,7 +56,7 @@ def test_a_cut_off_movie_is_told_from_a_whole_one(addon, scene, tmp_path, contai
 
 
 @pytest.mark.parametrize("is_compressed", [True, False])
-def test_a_cut_off_blend_is_told_from_a_whole_one(addon, tmp_path, is_compressed):
+def test_truncated_blend_is_detected(addon, tmp_path, is_compressed):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "file.blend"), compress=is_compressed)
     check(addon, tmp_path / "file.blend", -1)
 

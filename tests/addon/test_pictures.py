@@ -24,7 +24,7 @@ def test_points_come_from_the_runs_metrics(addon, shot):
     assert run["preview"] is None
 
 
-def test_without_a_window_there_are_no_icons(addon, tmp_path):
+def test_icons_are_not_loaded_without_a_window(addon, tmp_path):
     assert addon("train.pictures").icon_of(tmp_path / "none.png") == 0
     assert addon("train.pictures").plot([(0.0, 1.0), (1.0, 2.0)]) == 0
 

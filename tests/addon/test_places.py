@@ -44,32 +44,32 @@ def plate_file() -> Path:
 
 def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     blend(project)
-    there = moved(project)
-    scene = opened(there)
-    assert addon("shot.selection").shot_folder(scene) == there / "people.splannequin"
-    assert addon("scene.paths").absolute(scene.splannequin.clip) == str(there / "people.mp4")
-    assert addon("process.steps").STEPS["import"].params(scene).source == str(there / "people.mp4")
-    assert addon("solve.cameras").find(scene, there / "people.splannequin", "CAMERA") == scene.camera
-    assert plate_file() == there / "people.splannequin" / "frames" / "000005.png"
+    destination = moved(project)
+    scene = opened(destination)
+    assert addon("shot.selection").shot_folder(scene) == destination / "people.splannequin"
+    assert addon("scene.paths").absolute(scene.splannequin.clip) == str(destination / "people.mp4")
+    assert addon("process.steps").STEPS["import"].params(scene).source == str(destination / "people.mp4")
+    assert addon("solve.cameras").find(scene, destination / "people.splannequin", "CAMERA") == scene.camera
+    assert plate_file() == destination / "people.splannequin" / "frames" / "000005.png"
     assert (
         addon("process.steps")
         .STEPS["solve"]
-        .view(scene, addon("shot.inventory").read(there / "people.splannequin"))
+        .view(scene, addon("shot.inventory").read(destination / "people.splannequin"))
         .done
     )
 
 
 @pytest.mark.parametrize("name", ["ignore_path", "people_path", "st_map", "cameras_path"])
-def test_what_a_solve_is_given_is_found_again_in_a_project_that_is_moved(addon, project, name):
+def test_solve_inputs_are_found_in_a_moved_project(addon, project, name):
     (project / "given.exr").touch()
     setattr(bpy.context.scene.splannequin, name, str(project / "given.exr"))
     blend(project)
-    there = moved(project)
-    held = opened(there).splannequin
-    assert addon("scene.paths").absolute(getattr(held, name)) == str(there / "given.exr")
+    destination = moved(project)
+    settings = opened(destination).splannequin
+    assert addon("scene.paths").absolute(getattr(settings, name)) == str(destination / "given.exr")
 
 
-def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
+def test_copied_project_uses_the_copied_files(addon, project):
     blend(project)
     copy = Path(shutil.copytree(project, project.with_name("copy")))
     scene = opened(copy)
@@ -78,17 +78,17 @@ def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
 
 
 @pytest.mark.skipif(os.sep != "/", reason="there a backslash is what it is")
-def test_a_file_that_was_saved_on_windows_finds_its_shot_elsewhere(addon, project):
+def test_file_saved_on_windows_finds_its_shot_on_other_systems(addon, project):
     """On Windows, Blender writes backslashes into relative paths."""
     (project / "scenes").mkdir()
     odd = project / "scenes" / "a\\b.exr"
     odd.touch()
     blend(project / "scenes")
-    held, image = bpy.context.scene.splannequin, bpy.context.scene.camera.data.background_images[0].image
-    assert held.clip == "//../people.mp4"
-    for owner, name in ((held, "clip"), (held, "shot_path"), (image, "filepath")):
+    settings, image = bpy.context.scene.splannequin, bpy.context.scene.camera.data.background_images[0].image
+    assert settings.clip == "//../people.mp4"
+    for owner, name in ((settings, "clip"), (settings, "shot_path"), (image, "filepath")):
         setattr(owner, name, getattr(owner, name).replace("/", "\\").replace("\\\\", "//", 1))
-    held.st_map = "//a\\b.exr"
+    settings.st_map = "//a\\b.exr"
     bpy.ops.wm.save_mainfile()
     scene = opened(project / "scenes")
     assert addon("scene.paths").absolute(scene.splannequin.clip) == str(project / "people.mp4")
@@ -97,19 +97,19 @@ def test_a_file_that_was_saved_on_windows_finds_its_shot_elsewhere(addon, projec
     assert addon("scene.paths").absolute(scene.splannequin.st_map) == str(odd), "a name of Linux's own"
 
 
-def test_an_older_file_that_holds_whole_paths_is_found_beside(addon, project):
+def test_older_file_with_absolute_paths_finds_its_neighbours(addon, project):
     bpy.context.preferences.filepaths.use_relative_paths = False
     try:
         blend(project)
         assert Path(bpy.context.scene.splannequin.clip).is_absolute(), "as the artist has set Blender"
     finally:
         bpy.context.preferences.filepaths.use_relative_paths = True
-    there = moved(project)
-    scene = opened(there)
-    assert addon("shot.selection").shot_folder(scene) == there / "people.splannequin"
+    destination = moved(project)
+    scene = opened(destination)
+    assert addon("shot.selection").shot_folder(scene) == destination / "people.splannequin"
 
 
-def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_path):
+def test_save_as_and_save_copy_keep_the_shot(addon, project, tmp_path):
     blend(project)
     (tmp_path / "other").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "copy.blend"), copy=True)
@@ -139,86 +139,87 @@ def painted_on(shot: Path):
     return image
 
 
-def test_saving_elsewhere_keeps_where_a_bake_goes_and_what_is_painted(addon, project, tmp_path):
+def test_save_as_keeps_bake_output_and_paint(addon, project, tmp_path):
     shot, mattes = project / "people.splannequin", addon("solve.mattes")
     image = painted_on(shot)
     addon("bake.rendering").choose_output(bpy.context.scene, shot, "freeze")
     wanted = shot / "bake" / "freeze" / "######"
     blend(project)
     assert bpy.context.scene.render.filepath == "//people.splannequin/bake/freeze/######"
-    there = tmp_path / "other" / "deep"
-    there.mkdir(parents=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(there / "copy.blend"), copy=True)
+    destination = tmp_path / "other" / "deep"
+    destination.mkdir(parents=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(destination / "copy.blend"), copy=True)
     assert bpy.context.scene.render.filepath == "//people.splannequin/bake/freeze/######", "the open file stays"
     assert mattes.find_image(shot, 6) == image
-    blend(there)
+    blend(destination)
     assert output() == wanted and mattes.find_image(shot, 6) is not None
-    opened(there)
+    opened(destination)
     assert output() == wanted and mattes.find_image(shot, 6) is not None
-    bpy.ops.wm.open_mainfile(filepath=str(there / "copy.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(destination / "copy.blend"))
     assert output() == wanted and mattes.find_image(shot, 6) is not None
 
 
-@pytest.mark.parametrize("own", ["//out/######", "//people.splannequin/bake/mine_####"])
-def test_an_output_path_of_the_artists_is_left_as_it_is(project, tmp_path, own):
+@pytest.mark.parametrize("artists_path", ["//out/######", "//people.splannequin/bake/mine_####"])
+def test_an_output_path_of_the_artists_is_left_as_it_is(project, tmp_path, artists_path):
     blend(project)
-    bpy.context.scene.render.filepath = own
+    bpy.context.scene.render.filepath = artists_path
     blend(tmp_path)
-    assert bpy.context.scene.render.filepath == own
+    assert bpy.context.scene.render.filepath == artists_path
 
 
-def test_an_older_file_that_holds_a_whole_output_path_bakes_beside_itself(addon, project):
+def test_older_file_with_absolute_output_bakes_next_to_itself(addon, project):
     bpy.context.preferences.filepaths.use_relative_paths = False
     try:
         addon("bake.rendering").choose_output(bpy.context.scene, project / "people.splannequin", "freeze")
         blend(project)
     finally:
         bpy.context.preferences.filepaths.use_relative_paths = True
-    there = moved(project)
-    opened(there)
-    assert output() == there / "people.splannequin" / "bake" / "freeze" / "######"
+    destination = moved(project)
+    opened(destination)
+    assert output() == destination / "people.splannequin" / "bake" / "freeze" / "######"
 
 
 def test_what_is_painted_and_where_a_bake_goes_follow_a_shot_that_is_located(addon, project):
-    before, there = project / "people.splannequin", project / "renamed.splannequin"
+    before, destination = project / "people.splannequin", project / "renamed.splannequin"
     painted_on(before)
     addon("bake.rendering").choose_output(bpy.context.scene, before, "freeze")
     blend(project)
-    before.rename(there)
+    before.rename(destination)
     scene = opened(project)
-    addon("shot.places").locate(scene, there)
-    assert output() == there / "bake" / "freeze" / "######"
-    assert addon("solve.mattes").find_image(there, 6) is not None
+    addon("shot.places").locate(scene, destination)
+    assert output() == destination / "bake" / "freeze" / "######"
+    assert addon("solve.mattes").find_image(destination, 6) is not None
 
 
 def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     blend(project)
     addon("process.steps")
-    before, there = project / "people.splannequin", project / "renamed.splannequin"
-    before.rename(there)
+    before, destination = project / "people.splannequin", project / "renamed.splannequin"
+    before.rename(destination)
     scene = opened(project)
     watch = addon("process.job_timer").watch_of(before)
     assert addon("shot.selection").missing(scene, watch.state)
     for step in ("solve", "train", "freeze", "bake"):
-        with pytest.raises(contract.JobError, match="no longer exists") as told:
+        with pytest.raises(contract.JobError, match="no longer exists") as error:
             addon("process.begin").begin(scene, step)
-        assert "Locate" in told.value.hint
+        assert "Locate" in error.value.hint
     with pytest.raises(contract.JobError):
         addon("freeze.takes").freeze_from(scene, contract.CameraPath(4, 4, []))
     assert not before.exists()
     with pytest.raises(RuntimeError, match="is not a shot folder"):
         bpy.ops.splannequin.locate_shot(directory=str(project))
-    assert bpy.ops.splannequin.locate_shot(directory=f"{there}/") == {"FINISHED"}
+    assert bpy.ops.splannequin.locate_shot(directory=f"{destination}/") == {"FINISHED"}
     assert (
-        addon("shot.selection").shot_folder(scene) == there and scene.splannequin.shot_path == "//renamed.splannequin"
+        addon("shot.selection").shot_folder(scene) == destination
+        and scene.splannequin.shot_path == "//renamed.splannequin"
     )
-    assert addon("solve.cameras").find(scene, there, "CAMERA") == scene.camera
-    assert plate_file() == there / "frames" / "000005.png"
-    assert addon("bake.shown_take").shown(scene, there) == "freeze", "the compositor's frames followed"
-    assert not addon("shot.selection").missing(scene, addon("shot.inventory").read(there))
+    assert addon("solve.cameras").find(scene, destination, "CAMERA") == scene.camera
+    assert plate_file() == destination / "frames" / "000005.png"
+    assert addon("bake.shown_take").shown(scene, destination) == "freeze", "the compositor's frames followed"
+    assert not addon("shot.selection").missing(scene, addon("shot.inventory").read(destination))
 
 
-def test_a_shot_that_is_yet_to_be_made_is_not_missed(addon, scene, tmp_path):
+def test_shot_before_its_first_import_is_not_reported_missing(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "new.mp4")
     folder = addon("shot.selection").shot_folder(scene)
     assert not addon("shot.selection").missing(scene, addon("shot.inventory").read(folder))
@@ -232,7 +233,7 @@ def test_the_timer_remembers_a_shot_that_was_chosen(addon, scene, shot):
     assert addon("shot.selection").missing(scene, addon("shot.inventory").read(shot))
 
 
-def test_the_footage_of_a_moved_shot_is_found_beside_it(addon, scene, shot, clip, tmp_path):
+def test_moved_shot_finds_footage_next_to_it(addon, scene, shot, clip, tmp_path):
     info = json.loads((shot / "shot.json").read_text())
     (shot / "shot.json").write_text(json.dumps(info | {"source": "/nowhere/footage/people.mp4"}))
     places, shots = addon("shot.places"), addon("shot.inventory")
@@ -261,7 +262,7 @@ def test_a_failed_import_leaves_no_empty_shot(addon, scene, tmp_path):
     assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
 
 
-def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, scene, tmp_path):
+def test_failed_import_leaves_no_shot_and_is_reported(addon, scene, tmp_path):
     wrong = tmp_path / "text.mp4"
     wrong.write_text("no video")
     scene.splannequin.clip = str(wrong)
@@ -276,19 +277,19 @@ def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, sc
     assert watch.jobs["import"].state == "failed" and "text.mp4" in watch.jobs["import"].status.message
 
 
-def test_a_failed_import_is_taken_away_once_its_process_has_ended(addon, contract, tmp_path):
+def test_failed_import_is_removed_after_its_process_ended(addon, contract, tmp_path):
     """The process reports its end before it releases the shot's lock and, on Windows, its log."""
     supervisor, jobs, shot = addon("process.job_timer"), addon("process.jobs"), tmp_path / "text.splannequin"
     addon("shot.inventory").create(shot)
     job = jobs.new_job(shot, "import", contract.ImportParams("text.mp4"))
     job.process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    pid, here = job.process.pid, contract.computer_name()
+    pid, computer = job.process.pid, contract.computer_name()
     began = contract.process_start(pid)
     contract.write_json(
-        contract.ShotFolder(shot).lock, dataclasses.asdict(contract.Writer(here, pid, began, "import", "j", 1.0))
+        contract.ShotFolder(shot).lock, dataclasses.asdict(contract.Writer(computer, pid, began, "import", "j", 1.0))
     )
     supervisor.follow("import", job)
-    status = contract.Status("import", "failed", pid, 1.0, began, 1.0, message="No video.", exit_code=3, host=here)
+    status = contract.Status("import", "failed", pid, 1.0, began, 1.0, message="No video.", exit_code=3, host=computer)
     contract.write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
     supervisor.tick()
     assert job.ended and shot.is_dir()
@@ -321,9 +322,9 @@ def test_a_folder_that_cannot_be_is_one_sentence(addon, scene, clip, tmp_path, w
     if where.startswith("/") and not Path("/sys/kernel").is_dir():
         pytest.skip("no folder here that even root cannot write to")
     scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(folder)
-    with pytest.raises(RuntimeError, match="Cannot write to") as told:
+    with pytest.raises(RuntimeError, match="Cannot write to") as error:
         bpy.ops.splannequin.import_clip()
-    assert str(told.value).strip().count("\n") == 0
+    assert str(error.value).strip().count("\n") == 0
     watch = addon("process.job_timer").watch_of(folder)
     assert "Cannot write to" in watch.failures["import"][0]
     addon("process.job_timer").tick()
@@ -338,6 +339,6 @@ def test_a_folder_that_cannot_be_is_one_sentence(addon, scene, clip, tmp_path, w
 def test_a_keyed_camera_of_a_moved_shot_is_found(addon, shot):
     (shot / "paths").mkdir()
     shutil.copy(shot / "solve" / "cameras.json", shot / "paths" / "freeze.json")
-    told = shot / "takes" / "freeze" / "take.json"
-    told.write_text(json.dumps(json.loads(told.read_text()) | {"camera_path": "/nowhere/paths/freeze.json"}))
+    take_file = shot / "takes" / "freeze" / "take.json"
+    take_file.write_text(json.dumps(json.loads(take_file.read_text()) | {"camera_path": "/nowhere/paths/freeze.json"}))
     assert addon("freeze.takes").take_params(shot, "freeze").camera_path == str(shot / "paths" / "freeze.json")

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from tests.addon.data import make_detail as made
+from tests.addon.data import make_detail
 
 DATA = Path(__file__).resolve().parent / "data"
 
@@ -31,28 +31,29 @@ def footage(scene, shot, tmp_path):
     folder, take = tmp_path / "the plate", shot / "takes" / "detail"
     shutil.copytree(DATA / "detail" / "plate", folder)
     shutil.copytree(DATA / "detail", take, ignore=shutil.ignore_patterns("plate"))
-    scene.render.resolution_x, scene.render.resolution_y = made.WIDTH, made.HEIGHT
+    scene.render.resolution_x, scene.render.resolution_y = make_detail.WIDTH, make_detail.HEIGHT
     (take / "stmap").mkdir()
-    image = bpy.data.images.new("map", made.WIDTH, made.HEIGHT, float_buffer=True, is_data=True)
-    mirrored = np.ones((made.HEIGHT, made.WIDTH, 4), np.float32)
-    mirrored[..., 0] = 1.0 - (np.arange(made.WIDTH) + 0.5) / made.WIDTH
-    mirrored[..., 1] = ((np.arange(made.HEIGHT) + 0.5) / made.HEIGHT)[:, None]
+    image = bpy.data.images.new("map", make_detail.WIDTH, make_detail.HEIGHT, float_buffer=True, is_data=True)
+    mirrored = np.ones((make_detail.HEIGHT, make_detail.WIDTH, 4), np.float32)
+    mirrored[..., 0] = 1.0 - (np.arange(make_detail.WIDTH) + 0.5) / make_detail.WIDTH
+    mirrored[..., 1] = ((np.arange(make_detail.HEIGHT) + 0.5) / make_detail.HEIGHT)[:, None]
     image.pixels.foreach_set(mirrored.ravel())
     image.filepath_raw, image.file_format = str(take / "stmap" / "undistort.exr"), "OPEN_EXR"
     image.save()
     bpy.data.images.remove(image)
 
-    def tell(lens: bool = False, unlike: str = ""):
+    def write_take(lens: bool = False, reason: str = ""):
         facts = {"version": 1, "take": "detail", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 2}
-        facts |= {"width": made.WIDTH, "height": made.HEIGHT, "first": 5, "last": 6, "camera_path": ""}
+        facts |= {"width": make_detail.WIDTH, "height": make_detail.HEIGHT, "first": 5, "last": 6, "camera_path": ""}
         facts["footage"] = {
-            "file": str(folder / "000005.exr"), "beside": "", "size": [made.WIDTH, made.HEIGHT], "first": 5, "last": 6,
-            "probe": [0.78125, 0.390625, 0.1953125], "space": "linear, Rec.709", "unlike": unlike,
+            "file": str(folder / "000005.exr"), "beside": "", "size": [make_detail.WIDTH, make_detail.HEIGHT],
+            "first": 5, "last": 6, "probe": [0.78125, 0.390625, 0.1953125],
+            "space": "linear, Rec.709", "unlike": reason,
             "map": "stmap/undistort.exr" if lens else "",
         }  # fmt: skip
         (take / "take.json").write_text(json.dumps(facts))
 
-    return tell
+    return write_take
 
 
 def links(tree) -> set:
@@ -125,7 +126,7 @@ def test_a_lens_comes_between_and_goes_with_the_artists_links(bake, footage):
     assert not [g for g in bpy.data.node_groups if "Undistort" in g.name]
 
 
-def test_a_node_of_the_artists_between_plate_and_lens_stays_there(bake, footage):
+def test_artist_node_between_plate_and_lens_is_kept(bake, footage):
     footage(lens=True)
     tree, group = bake("detail")
     lens, blur = named(tree, "Undistort Plate"), tree.nodes.new("CompositorNodeBlur")
@@ -138,7 +139,7 @@ def test_a_node_of_the_artists_between_plate_and_lens_stays_there(bake, footage)
     assert path_into(group.inputs["Image"]) == ["Fit Plate", blur.name, "Plate"]
 
 
-def test_what_the_artist_leads_in_instead_is_left_alone(bake, footage):
+def test_artist_link_into_the_group_is_kept(bake, footage):
     tree, group = bake()
     colour = tree.nodes.new("CompositorNodeRGB")
     tree.links.new(colour.outputs[0], group.inputs["Image"])
@@ -157,10 +158,10 @@ def test_what_the_artist_leads_in_instead_is_left_alone(bake, footage):
 
 def test_a_picture_of_the_artists_in_our_node_stays(bake):
     tree, _ = bake()
-    own = bpy.data.images.new("denoised", 16, 12)
-    named(tree, "Plate").image = own
+    artists_image = bpy.data.images.new("denoised", 16, 12)
+    named(tree, "Plate").image = artists_image
     bake()
-    assert named(tree, "Plate").image == own
+    assert named(tree, "Plate").image == artists_image
 
 
 def test_a_copy_of_our_node_is_the_artists(bake, footage):
@@ -192,9 +193,7 @@ def test_how_the_plate_is_fitted_follows_its_shape_and_else_stays_as_set(addon, 
     assert how(fit).upper() == "FIT"
 
 
-def test_a_stream_that_was_brought_to_another_plate_renders_as_one_made_anew(
-    addon, bake, footage, scene, tmp_path, pictures
-):
+def test_stream_moved_to_another_plate_renders_like_a_new_one(addon, bake, footage, scene, tmp_path, pictures):
     def render(name: str) -> np.ndarray:
         _, group = bake("detail")
         group.inputs["Mix"].default_value = 0.0

@@ -19,8 +19,8 @@ def test_what_a_class_and_its_base_assign_becomes_what_blender_reads(addon):
         bpy.utils.register_class(Group)
         properties.release(Group)
         try:
-            told = Group.bl_rna.properties
-            assert (told["count"].default, told["word"].default) == (3, "a")
+            rna_properties = Group.bl_rna.properties
+            assert (rna_properties["count"].default, rna_properties["word"].default) == (3, "a")
             assert "count" not in vars(Base) and "word" not in vars(Group)
         finally:
             bpy.utils.unregister_class(Group)
@@ -38,8 +38,8 @@ def test_every_property_that_a_class_assigns_is_blenders_and_nothing_of_it_is_le
             known = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type().properties
         for one in cls.__mro__:
             assert not [n for n, v in vars(one).items() if isinstance(v, properties._Declared)], cls
-            told = inspect.get_annotations(one) if one in properties._declared else {}
-            assert all(isinstance(kind, str) for kind in told.values()), cls
-            assert all(name in known for name in told), cls
-            seen += len(told)
+            annotations = inspect.get_annotations(one) if one in properties._declared else {}
+            assert all(isinstance(kind, str) for kind in annotations.values()), cls
+            assert all(name in known for name in annotations), cls
+            seen += len(annotations)
     assert seen > 60

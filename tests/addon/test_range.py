@@ -26,7 +26,7 @@ def test_a_bake_asks_for_the_scenes_range_and_step_of_the_take(addon, with_shot,
     assert addon("process.steps").STEPS["freeze"].params(scene).first is None, "the freeze is about all of the clip"
 
 
-def test_a_bake_freezes_what_is_missing_and_so_needs_a_run_and_no_take(addon, with_shot, shot):
+def test_bake_freezes_missing_frames_and_needs_only_a_run(addon, with_shot, shot):
     bake = addon("process.steps").STEPS["bake"]
     shutil.rmtree(shot / "takes" / "freeze")
     view = bake.view(with_shot, addon("shot.inventory").read(shot))
@@ -55,11 +55,11 @@ def test_a_bake_follows_the_keys_of_t_star_as_they_are_now(addon, with_shot, sho
     with_shot.keyframe_insert("splannequin.t_star", frame=5)
     props.t_star = 7
     with_shot.keyframe_insert("splannequin.t_star", frame=7)
-    asked = steps.STEPS["bake"].params(with_shot).t_star_per_frame
-    assert asked["5"] == 5.0 and asked["7"] == 7.0
+    requested = steps.STEPS["bake"].params(with_shot).t_star_per_frame
+    assert requested["5"] == 5.0 and requested["7"] == 7.0
 
 
-def test_complete_is_about_the_frames_that_are_asked_for(addon, shot):
+def test_completeness_counts_only_requested_frames(addon, shot):
     addon("process.steps")
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     assert not addon("freeze.takes").complete(shot, "freeze")
@@ -96,7 +96,7 @@ def test_a_take_tells_by_content_whether_its_run_was_trained_on(addon, contract,
     assert stale(shot, "freeze")
 
 
-def test_frames_of_the_range_that_the_take_lacks_are_told(addon, with_shot, shot):
+def test_missing_frames_of_the_range_are_reported(addon, with_shot, shot):
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     with_shot.frame_start, with_shot.frame_end = 5, 7
     said = addon("bake.insertion").insert(with_shot, shot, "freeze")
@@ -124,11 +124,11 @@ def test_headless_bakes_a_part_of_a_take_and_leaves_it_in_the_file(addon, shot, 
 def larger_plate(shot, times: int) -> None:
     """Enlarge the shot's recorded plate size and camera intrinsics `times` times."""
     for name in ("shot.json", "solve/cameras.json"):
-        told = json.loads((shot / name).read_text())
-        told |= {"width": 16 * times, "height": 12 * times}
-        for frame in told.get("frames", []):
+        facts = json.loads((shot / name).read_text())
+        facts |= {"width": 16 * times, "height": 12 * times}
+        for frame in facts.get("frames", []):
             frame["K"] = [times * value for value in frame["K"]]
-        (shot / name).write_text(json.dumps(told))
+        (shot / name).write_text(json.dumps(facts))
 
 
 def size_of(scene) -> tuple[int, int, int]:

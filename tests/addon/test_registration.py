@@ -144,7 +144,7 @@ def test_of_two_installed_copies_the_second_is_refused(root, tmp_path, first):
     assert "held\n" in done.stdout, done.stdout[-2000:] + done.stderr[-2000:]
 
 
-def test_the_panels_stand_in_order_in_one_tab(addon):
+def test_panels_are_in_order_in_one_tab(addon):
     steps = addon("process.steps").STEPS.values()
     assert [step.panel.title for step in steps] == ["1  Import", "2  Solve", "3  Train", "4  Freeze", "5  Bake"]
     tab = bpy.types.SPLANNEQUIN_PT_shots

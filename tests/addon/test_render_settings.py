@@ -191,7 +191,7 @@ def test_an_output_path_that_means_nothing_is_refused_in_words(baked, tmp_path):
     assert baked.render.filepath == str(tmp_path / "{nothing}" / "f")
 
 
-def test_the_artists_own_templates_are_filled_in(baked, tmp_path):
+def test_output_path_templates_are_filled_in(baked, tmp_path):
     baked.render.filepath = str(tmp_path / "out" / "f_##")
     if bpy.app.version >= (5, 0, 0):
         baked.render.filepath = str(tmp_path / "{scene_name}" / "f_##")
@@ -238,11 +238,11 @@ def test_a_file_that_is_saved_while_it_is_baked_holds_the_artists_settings(addon
     assert scene.render.use_border
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["000005.png", "000007.png"], "it goes on"
     bpy.ops.wm.open_mainfile(filepath=str(file))
-    held = bpy.context.scene.render
-    assert held.use_border and held.use_crop_to_border and held.filepath.endswith("f_##")
+    render = bpy.context.scene.render
+    assert render.use_border and render.use_crop_to_border and render.filepath.endswith("f_##")
     bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(crashed)) as (there, wanted):
-        wanted.scenes = there.scenes
+    with bpy.data.libraries.load(str(crashed)) as (stored, wanted):
+        wanted.scenes = stored.scenes
     assert not wanted.scenes[0].render.use_border, "so it was written"
     settings._on_load()
     assert wanted.scenes[0].render.use_border and "splannequin_bake_settings" not in wanted.scenes[0]

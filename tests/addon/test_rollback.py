@@ -4,15 +4,15 @@ import bpy
 import pytest
 
 
-def test_a_change_that_fails_takes_back_what_it_made_and_set(addon, scene):
+def test_failed_change_is_rolled_back(addon, scene):
     scene.render.resolution_x, scene.frame_end = 640, 40
     camera, objects = scene.camera, set(bpy.data.objects)
     with pytest.raises(OSError, match="gone"), addon("scene.rollback").scene_of(scene):
         scene.render.resolution_x, scene.frame_end = 1280, 80
         scene["splannequin_note"] = 1
-        made = bpy.data.objects.new("made", bpy.data.cameras.new("made"))
-        scene.collection.objects.link(made)
-        scene.camera = made
+        created = bpy.data.objects.new("made", bpy.data.cameras.new("made"))
+        scene.collection.objects.link(created)
+        scene.camera = created
         raise OSError("the disk is gone")
     assert (scene.render.resolution_x, scene.frame_end) == (640, 40)
     assert scene.camera == camera and set(bpy.data.objects) == objects

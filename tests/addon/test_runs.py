@@ -17,9 +17,9 @@ CONFIG = {
 
 def checkpoint(path: Path, **facts) -> None:
     """Write a checkpoint file in safetensors format: the header and one tensor."""
-    told = {"version": 1, "key": "k", "config": CONFIG, "trained_seconds": 10.0, **facts}
+    record = {"version": 1, "key": "k", "config": CONFIG, "trained_seconds": 10.0, **facts}
     tensor = {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}
-    header = json.dumps({"__metadata__": {"splannequin": json.dumps(told)}, "means": tensor}).encode()
+    header = json.dumps({"__metadata__": {"splannequin": json.dumps(record)}, "means": tensor}).encode()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(struct.pack("<Q", len(header)) + header + b"\0\0\0\0")
 
@@ -29,8 +29,8 @@ def with_runs(scene, shot):
     """Test shot with a finished run `main`, a paused run `better`, and a second take."""
     scene.splannequin.shot_path = str(shot)
     summary = shot / "runs" / "main" / "summary.json"
-    told = {**json.loads(summary.read_text()), "preset": "preview", "key": "k", "train_seconds": 125.0}
-    summary.write_text(json.dumps(told))
+    record = {**json.loads(summary.read_text()), "preset": "preview", "key": "k", "train_seconds": 125.0}
+    summary.write_text(json.dumps(record))
     checkpoint(shot / "runs" / "main" / "checkpoint.safetensors", iteration=900)
     checkpoint(shot / "runs" / "better" / "checkpoint.safetensors", iteration=300)
     return scene
@@ -78,36 +78,41 @@ def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, sh
     assert plan(addon, with_runs).button == "Continue Training", "the run that is there is of the preset that is chosen"
     props.preset = "final"
     assert plan(addon, with_runs).kind == "resume" and "does not change" in plan(addon, with_runs).words
-    asked = addon("process.steps").STEPS["train"].params(with_runs)
-    assert (asked.run, asked.preset, asked.seed, asked.iterations, asked.extend) == ("main", "final", 9, 900, 0)
+    params = addon("process.steps").STEPS["train"].params(with_runs)
+    assert (params.run, params.preset, params.seed, params.iterations, params.extend) == ("main", "final", 9, 900, 0)
 
 
-def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
+def test_train_request_matches_its_button_label(addon, with_runs, shot):
     props, steps = with_runs.splannequin, addon("process.steps").STEPS
     props.extend_steps = 70
-    asked = steps["train"].params(with_runs)
-    assert (asked.run, asked.extend, asked.iterations) == ("main", 70, 0)
+    params = steps["train"].params(with_runs)
+    assert (params.run, params.extend, params.iterations) == ("main", 70, 0)
     checkpoint(
         shot / "runs" / "main" / "extension.safetensors", iteration=1000,
         extensions=[{"from_iteration": 900, "steps": 300}],
     )  # fmt: skip
     assert steps["train"].params(with_runs).extend == 300, "the steps that were begun, not those in the field"
     props.run_name = "better"
-    asked = steps["train"].params(with_runs)
-    assert (asked.run, asked.extend, asked.iterations, asked.width) == ("better", 0, 900, 48)
-    assert (asked.max_gaussians, asked.holdout, asked.seed) == (1234, 5, 7)
-    assert (asked.host, asked.host_config, asked.supervision, asked.detector) == ("mlp", "reference", "paper", "weight")
+    params = steps["train"].params(with_runs)
+    assert (params.run, params.extend, params.iterations, params.width) == ("better", 0, 900, 48)
+    assert (params.max_gaussians, params.holdout, params.seed) == (1234, 5, 7)
+    assert (params.host, params.host_config, params.supervision, params.detector) == (
+        "mlp",
+        "reference",
+        "paper",
+        "weight",
+    )
     props.preset = "standard"
     assert (steps["train"].params(with_runs).preset, steps["train"].params(with_runs).iterations) == ("standard", 0)
     props.run_name = "new"
     assert steps["train"].params(with_runs).extend == 0
 
 
-def test_depth_maps_are_asked_for_and_other_ones_train_anew(addon, with_runs, shot, tmp_path):
+def test_new_depth_maps_restart_training(addon, with_runs, shot, tmp_path):
     props, step = with_runs.splannequin, addon("process.steps").STEPS["train"]
     props.run_name, props.depth = "new", f"{tmp_path / 'depth'}{os.sep}"
-    asked = step.params(with_runs)
-    assert (asked.depth, asked.extend) == (str(tmp_path / "depth"), 0)
+    params = step.params(with_runs)
+    assert (params.depth, params.extend) == (str(tmp_path / "depth"), 0)
     props.run_name = "main"
     training = addon("train.training")
 
@@ -117,9 +122,9 @@ def test_depth_maps_are_asked_for_and_other_ones_train_anew(addon, with_runs, sh
 
     assert plan_now().kind == "anew" and "depth" in plan_now().words
     assert step.params(with_runs).depth == str(tmp_path / "depth")
-    told = {"key": "d", "source": str(tmp_path / "depth")}
-    checkpoint(shot / "runs" / "main" / "checkpoint.safetensors", iteration=900, depth=told)
-    checkpoint(shot / "runs" / "better" / "checkpoint.safetensors", iteration=300, depth=told)
+    record = {"key": "d", "source": str(tmp_path / "depth")}
+    checkpoint(shot / "runs" / "main" / "checkpoint.safetensors", iteration=900, depth=record)
+    checkpoint(shot / "runs" / "better" / "checkpoint.safetensors", iteration=300, depth=record)
     assert plan_now().kind == "extend" and step.params(with_runs).depth == "", "the run has its own copy"
     props.depth = ""
     assert plan_now().kind == "extend"
@@ -132,7 +137,7 @@ def test_depth_maps_are_asked_for_and_other_ones_train_anew(addon, with_runs, sh
 def test_the_panel_says_how_depth_maps_fit(addon, with_runs, shot):
     step, inventory = addon("process.steps").STEPS["train"], addon("shot.inventory")
     file = shot / "runs" / "main" / "summary.json"
-    told = json.loads(file.read_text())
+    record = json.loads(file.read_text())
     good = {"linear_in": "inverse depth", "residual": 0.0312, "frames": 38, "of_frames": 40}
     for facts, shown in (
         (good, True),
@@ -140,7 +145,7 @@ def test_the_panel_says_how_depth_maps_fit(addon, with_runs, shot):
         ({**good, "frames": "38"}, False),
         (7, False),
     ):
-        file.write_text(json.dumps({**told, "depth": facts}))
+        file.write_text(json.dumps({**record, "depth": facts}))
         lines = step.view(with_runs, inventory.read(shot)).state
         assert any("inverse depth" in line and "3.1 %" in line for line in lines) == shown
 
@@ -180,7 +185,7 @@ def test_broken_checkpoints_are_passed_over(addon, shot, tmp_path):
     assert addon("shot.inventory").read(shot).unfinished == {}
 
 
-def test_runs_and_takes_stand_side_by_side(addon, with_runs, shot, new_take):
+def test_runs_and_takes_are_listed_together(addon, with_runs, shot, new_take):
     new_take(shot, "second")
     state, listing = addon("shot.inventory").read(shot), addon("ui.listing")
     assert listing.run_rows(state) == [
@@ -247,11 +252,11 @@ def test_new_buttons_have_tooltips(addon):
         assert all(p.identifier == "rna_type" or p.description for p in kind.properties), cls
 
 
-def test_the_curve_of_an_added_stretch_follows_the_runs_own(addon):
-    told = {"history": [(1.0, 20.0), (2.0, 21.0), (3.0, 22.0)]}
+def test_extension_curve_continues_the_run_curve(addon):
+    record = {"history": [(1.0, 20.0), (2.0, 21.0), (3.0, 22.0)]}
     history = addon("train.training").history
-    assert history(told, []) == told["history"]
-    assert history(told, [(2.5, 21.5), (4.0, 23.0)]) == [(1.0, 20.0), (2.0, 21.0), (2.5, 21.5), (4.0, 23.0)]
+    assert history(record, []) == record["history"]
+    assert history(record, [(2.5, 21.5), (4.0, 23.0)]) == [(1.0, 20.0), (2.0, 21.0), (2.5, 21.5), (4.0, 23.0)]
     assert history({}, [(1.0, 9.0)]) == [(1.0, 9.0)]
 
 

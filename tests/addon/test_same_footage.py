@@ -76,8 +76,8 @@ def test_a_sequence_is_known_by_any_of_its_pictures(addon, plate, tmp_path, monk
     shows = addon("scene.same_footage").shows
     assert shows(image(path, "SEQUENCE"), [plate])
     assert shows(image(path, "SEQUENCE"), [plate.with_name("plate.v002.####.png")])
-    other = path.replace("v002", "v001")
-    assert not shows(image(other, "SEQUENCE"), [plate]), "another version of the plate, with the same numbers"
+    other_version = path.replace("v002", "v001")
+    assert not shows(image(other_version, "SEQUENCE"), [plate]), "another version of the plate, with the same numbers"
     assert not shows(image(path, "MOVIE"), [plate]) and not shows(None, [plate])
 
 
@@ -93,7 +93,7 @@ def test_a_video_is_known_by_its_file(addon, video, tmp_path, monkeypatch, kind)
     assert not shows(image(path, "MOVIE"), [tmp_path / "gone.mov"])
 
 
-def test_a_movie_clip_and_an_image_are_told_alike_and_a_still_is_no_sequence(addon, plate):
+def test_clip_and_image_of_one_footage_match_and_a_still_does_not(addon, plate):
     shows = addon("scene.same_footage").shows
     clip = bpy.data.movieclips.load(str(plate.with_name("plate.v002.0006.png")))
     assert clip.source == "SEQUENCE" and shows(clip, [plate])
@@ -114,19 +114,19 @@ def test_the_freeze_goes_behind_a_plate_of_a_project_that_was_moved(addon, scene
     info = contract.read_json(shot / "shot.json")
     contract.write_json(shot / "shot.json", {**info, "source": f"/old/project/plates/{plate.name}"})
     listing = contract.read_json(shot / "frames" / "frames.json")
-    beside = os.path.relpath(plate, shot)
-    contract.write_json(shot / "frames" / "frames.json", {**listing, "beside": beside})
+    relative_path = os.path.relpath(plate, shot)
+    contract.write_json(shot / "frames" / "frames.json", {**listing, "beside": relative_path})
     compat = addon("compat")
     tree = compat.new_compositor_tree(scene, "Artist")
-    node, other = (tree.nodes.new("CompositorNodeImage") for _ in range(2))
+    node, second_node = (tree.nodes.new("CompositorNodeImage") for _ in range(2))
     node.image = bpy.data.images.load(str(plate.with_name("plate.v002.0006.png")))
-    other.image = bpy.data.images.load(str(plate.with_name("plate.v001.0005.png")))
-    node.image.source = other.image.source = "SEQUENCE"
+    second_node.image = bpy.data.images.load(str(plate.with_name("plate.v001.0005.png")))
+    node.image.source = second_node.image.source = "SEQUENCE"
     over = tree.nodes.new("CompositorNodeAlphaOver")
-    for source, place in ((node, 1), (other, 2)):
+    for source, place in ((node, 1), (second_node, 2)):
         tree.links.new(source.outputs["Image"], [s for s in over.inputs if s.type == "RGBA"][place - 1])
     tree.links.new(over.outputs[0], compat.output_socket(tree))
     addon("bake.insertion").insert(scene, shot, "freeze")
     group = addon("bake.freeze_group").group_node(tree)
     assert [link.to_node for link in node.outputs["Image"].links] == [group]
-    assert [link.to_node for link in other.outputs["Image"].links] == [over]
+    assert [link.to_node for link in second_node.outputs["Image"].links] == [over]

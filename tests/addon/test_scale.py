@@ -83,7 +83,7 @@ def test_another_solve_is_guessed_anew_and_what_stood_without_a_guess_stays(addo
     assert not addon("solve.scale").scaled(scene, shot)
 
 
-def test_a_root_that_was_scaled_by_hand_is_left_alone(addon, scene, shot):
+def test_manually_scaled_root_is_not_changed(addon, scene, shot):
     with_floor(shot, 0.13)
     scene.splannequin.shot_path = str(shot)
     load, scale = addon("solve.arrival").load_camera, addon("shot.scene_objects").depth_scale

@@ -54,11 +54,11 @@ def seen_by_blender(scene, camera, size):
     return np.array(pixels), np.array(world)
 
 
-def projected(told, world):
+def projected(transforms, world):
     """[F, P, 2] pixels of the points `world` [F, P, 3], projected by a transforms.json."""
     pixels = []
-    for frame, points in zip(told["frames"], world, strict=True):
-        lens = {**told, **frame}
+    for frame, points in zip(transforms["frames"], world, strict=True):
+        lens = {**transforms, **frame}
         view = np.linalg.inv(np.array(frame["transform_matrix"]))
         x, y, z = view[:3, :3] @ points.T + view[:3, 3:]
         pixels.append(np.stack([lens["cx"] - lens["fl_x"] * x / z, lens["cy"] + lens["fl_y"] * y / z], axis=1))
@@ -76,13 +76,13 @@ def test_what_is_written_projects_as_blender_does(addon, chosen, shot, aspect, f
     params = addon("process.steps").STEPS["solve"].params(chosen)
     assert (chosen.frame_current, chosen.frame_subframe) == (40, 0.25)
     assert params.cameras == str(shot / "tracking" / "transforms.json")
-    told = json.loads((shot / "tracking" / "transforms.json").read_text(encoding="utf-8"))
-    assert [f["file_path"] for f in told["frames"]] == ["5.png", "6.png", "7.png"]
-    assert (told["w"], told["h"]) == (16, 12)
+    transforms = json.loads((shot / "tracking" / "transforms.json").read_text(encoding="utf-8"))
+    assert [f["file_path"] for f in transforms["frames"]] == ["5.png", "6.png", "7.png"]
+    assert (transforms["w"], transforms["h"]) == (16, 12)
     want, world = seen_by_blender(chosen, camera, (16, 12))
     assert np.ptp(want) > 4.0
-    np.testing.assert_allclose(projected(told, world), want, atol=1e-3 * 16 / 1920)
-    turns = np.array([f["transform_matrix"] for f in told["frames"]])[:, :3, :3]
+    np.testing.assert_allclose(projected(transforms, world), want, atol=1e-3 * 16 / 1920)
+    turns = np.array([f["transform_matrix"] for f in transforms["frames"]])[:, :3, :3]
     np.testing.assert_allclose(turns.swapaxes(1, 2) @ turns, np.broadcast_to(np.eye(3), turns.shape), atol=1e-6)
 
 
@@ -111,7 +111,7 @@ def test_the_timer_reads_it_in_turns_and_the_solve_begins(addon, chosen, shot):
     watch.jobs["solve"].process.wait()
 
 
-def test_a_camera_that_is_given_up_leaves_the_frame_and_the_shot(addon, chosen, shot):
+def test_cancelled_camera_restores_frame_and_shot(addon, chosen, shot):
     turns = addon("solve.scene_camera").write_in_turns(chosen, "match é", shot)
     chosen.frame_set(3)
     assert next(turns) == (1, 3) and chosen.frame_current == 5
@@ -169,7 +169,7 @@ def in_scene_world(shot):
     return shot
 
 
-def test_the_solve_stands_where_the_camera_stands(addon, contract, scene, in_scene_world):
+def test_solve_is_placed_at_the_scene_camera(addon, contract, scene, in_scene_world):
     shot = in_scene_world
     scene.splannequin.shot_path = str(shot)
     said = addon("solve.arrival").load_camera(scene, shot)
@@ -192,8 +192,8 @@ def test_a_shot_changes_worlds_and_keeps_what_the_artist_did_in_one(addon, scene
     assert np.abs(guess - np.eye(4)).max() > 0.1
     root.scale = (3.0, 3.0, 3.0)
     bpy.context.view_layer.update()
-    own = (shot / "solve" / "solve.json").read_text()
-    (shot / "solve" / "solve.json").write_text(json.dumps({**json.loads(own), "world": "scene"}))
+    solve_record = (shot / "solve" / "solve.json").read_text()
+    (shot / "solve" / "solve.json").write_text(json.dumps({**json.loads(solve_record), "world": "scene"}))
     load(scene, shot)
     np.testing.assert_allclose(np.array(root.matrix_world), np.eye(4), atol=1e-6)
     assert scale.scaled(scene, shot)
@@ -201,7 +201,7 @@ def test_a_shot_changes_worlds_and_keeps_what_the_artist_did_in_one(addon, scene
     bpy.context.view_layer.update()
     load(scene, shot)
     assert root.location[:] == (1.0, 2.0, 3.0), "who moves it in the scene's world means it"
-    (shot / "solve" / "solve.json").write_text(own)
+    (shot / "solve" / "solve.json").write_text(solve_record)
     load(scene, shot)
     np.testing.assert_allclose(np.array(root.matrix_world), guess, atol=1e-5)
     assert not scale.scaled(scene, shot)

@@ -83,11 +83,11 @@ def test_what_the_artist_deleted_is_let_go(addon, built, shot):
 
 def test_a_turn_of_the_timer_lists_no_scenes_objects(addon, built, shot):
     """A scene may have tens of thousands of objects, and the timer blocks Blender."""
-    made, called = addon("shot.scene_objects"), []
+    scene_objects, called = addon("shot.scene_objects"), []
     assert built.splannequin.camera_before is not None and built.splannequin.made[0].camera is not None
     sys.setprofile(lambda frame, event, _: called.append(frame.f_code.co_name) if event == "call" else None)
     try:
-        made.tidy(built)
+        scene_objects.tidy(built)
     finally:
         sys.setprofile(None)
     assert "tidy" in called and "users_scene" not in called
@@ -95,17 +95,17 @@ def test_a_turn_of_the_timer_lists_no_scenes_objects(addon, built, shot):
 
 
 def test_what_another_scene_has_is_not_let_go(addon, built, shot):
-    made, camera = addon("shot.scene_objects"), built.splannequin.made[0].camera
-    own = built.splannequin.camera_before
-    elsewhere = bpy.data.scenes.new("elsewhere")
-    for item in (camera, own):
+    scene_objects, camera = addon("shot.scene_objects"), built.splannequin.made[0].camera
+    camera_before = built.splannequin.camera_before
+    second_scene = bpy.data.scenes.new("elsewhere")
+    for item in (camera, camera_before):
         for collection in item.users_collection:
             collection.objects.unlink(item)
-        elsewhere.collection.objects.link(item)
-    made.tidy(built)
-    assert built.splannequin.made[0].camera == camera and built.splannequin.camera_before == own
-    bpy.data.scenes.remove(elsewhere)
-    made.tidy(built)
+        second_scene.collection.objects.link(item)
+    scene_objects.tidy(built)
+    assert built.splannequin.made[0].camera == camera and built.splannequin.camera_before == camera_before
+    bpy.data.scenes.remove(second_scene)
+    scene_objects.tidy(built)
     assert built.splannequin.made[0].camera is None and built.splannequin.camera_before is None
 
 
@@ -125,53 +125,57 @@ def test_ours_are_found_after_saving_and_in_a_full_copy_of_the_scene(addon, buil
 
 
 def test_two_shots_of_one_name_are_two(addon, built, shot, tmp_path):
-    cameras, made = addon("solve.cameras"), addon("shot.scene_objects")
-    other = tmp_path / "elsewhere" / shot.name
-    shutil.copytree(shot, other)
-    assert cameras.find(built, other, "CAMERA") is None
-    cameras.build(built, other)
-    cameras.remove(built, other)
+    cameras, scene_objects = addon("solve.cameras"), addon("shot.scene_objects")
+    second_shot = tmp_path / "elsewhere" / shot.name
+    shutil.copytree(shot, second_shot)
+    assert cameras.find(built, second_shot, "CAMERA") is None
+    cameras.build(built, second_shot)
+    cameras.remove(built, second_shot)
     assert cameras.find(built, shot, "CAMERA")
     moved = tmp_path / "moved" / shot.name
     shutil.move(shot, moved)
     assert cameras.find(built, moved, "CAMERA"), "a folder that was moved is the same shot"
-    made.new(built, moved)
+    scene_objects.new(built, moved)
     assert cameras.find(built, shot, "CAMERA") is None and len(built.splannequin.made) == 1
 
 
-def test_the_camera_that_was_there_before_comes_back(addon, built, shot):
-    cameras, own = addon("solve.cameras"), bpy.data.objects["Camera"]
+def test_previous_scene_camera_is_restored(addon, built, shot):
+    cameras, first_camera = addon("solve.cameras"), bpy.data.objects["Camera"]
     assert built.camera == cameras.find(built, shot, "CAMERA")
-    own.name = "renamed since"
+    first_camera.name = "renamed since"
     cameras.build(built, shot)
     cameras.remove(built, shot)
-    assert built.camera == own and built.splannequin.camera_before is None
+    assert built.camera == first_camera and built.splannequin.camera_before is None
     cameras.build(built, shot)
-    other = built.camera = duplicate(own)["renamed since"]
+    second_camera = built.camera = duplicate(first_camera)["renamed since"]
     cameras.remove(built, shot)
-    assert built.camera == other, "the artist chose another since"
+    assert built.camera == second_camera, "the artist chose another since"
     cameras.build(built, shot)
-    bpy.data.objects.remove(other)
+    bpy.data.objects.remove(second_camera)
     cameras.remove(built, shot)
     assert built.camera is None, "what was deleted does not come back"
-    built.camera = own
+    built.camera = first_camera
     cameras.build(built, shot)
     bpy.ops.object.select_all(action="DESELECT")
-    own.select_set(True)
+    first_camera.select_set(True)
     bpy.ops.object.delete()
     addon("shot.scene_objects").tidy(built)
     cameras.remove(built, shot)
-    assert built.camera is None and not own.users, "the file does not keep it"
+    assert built.camera is None and not first_camera.users, "the file does not keep it"
 
 
 def test_another_shots_camera_takes_the_place_of_a_removed_one(addon, built, shot, tmp_path):
-    cameras, own, other = addon("solve.cameras"), bpy.data.objects["Camera"], tmp_path / "second.splannequin"
-    shutil.copytree(shot, other)
-    cameras.build(built, other)
+    cameras, first_camera, second_shot = (
+        addon("solve.cameras"),
+        bpy.data.objects["Camera"],
+        tmp_path / "second.splannequin",
+    )
+    shutil.copytree(shot, second_shot)
+    cameras.build(built, second_shot)
     cameras.remove(built, shot)
-    assert built.camera == cameras.find(built, other, "CAMERA")
+    assert built.camera == cameras.find(built, second_shot, "CAMERA")
     cameras.build(built, shot)
     cameras.remove(built, shot)
-    assert built.camera == cameras.find(built, other, "CAMERA")
-    cameras.remove(built, other)
-    assert built.camera == own
+    assert built.camera == cameras.find(built, second_shot, "CAMERA")
+    cameras.remove(built, second_shot)
+    assert built.camera == first_camera

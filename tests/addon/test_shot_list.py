@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.fixture
-def other(shot, tmp_path):
+def second_shot(shot, tmp_path):
     """Second solved shot, also with frames 5 to 7."""
     folder = tmp_path / "second.splannequin"
     shutil.copytree(shot, folder)
@@ -17,26 +17,26 @@ def other(shot, tmp_path):
 
 
 @pytest.fixture
-def two(addon, scene, shot, other):
+def two(addon, scene, shot, second_shot):
     """Scene with both shots and their cameras; the second is chosen."""
     props = scene.splannequin
     props.shot_path, props.run_name = str(shot), "first run"
     addon("solve.arrival").load_camera(scene, shot)
     assert bpy.ops.splannequin.shot_add() == {"FINISHED"}
-    props.shot_path = str(other)
-    addon("solve.arrival").load_camera(scene, other)
+    props.shot_path = str(second_shot)
+    addon("solve.arrival").load_camera(scene, second_shot)
     return scene
 
 
-def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
+def test_settings_are_stored_and_restored_per_shot(addon, scene, shot, second_shot, clip):
     props, shot_list = scene.splannequin, addon("shot.selection")
     assert not bpy.ops.splannequin.shot_add.poll(), "there is no first shot yet"
     props.shot_path, props.clip = str(shot), "//first.mov"
-    own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
-    scene.collection.objects.link(own)
+    artists_camera = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
+    scene.collection.objects.link(artists_camera)
     tracked = bpy.data.movieclips.load(str(clip))
     values = {"run_name": "b", "preset": "final", "use_range": True, "first": 3, "last": 9, "t_star": 6}
-    values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
+    values |= {"choose_t_star": True, "path_camera": artists_camera, "freeze_width": 640, "live_show": "motion"}
     values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
     values |= {"overscan_percent": 4.0, "lut": "//look.cube", "use_start": True, "start": 1001}
     values |= {"detail": False, "develop": False, "passes": True, "deep": True, "motion_blur": True, "depth": "//depth"}
@@ -56,14 +56,14 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     bpy.ops.splannequin.shot_add()
     assert (props.clip, props.shot_path, props.run_name, props.path_camera) == ("", "", "main", None)
     assert props.set_up_scene, "what is the scene's own stays"
-    props.shot_path, props.t_star = str(other), 7
-    assert shot_list.folders(scene) == [shot, other] and addon("shot.selection").shot_folder(scene) == other
+    props.shot_path, props.t_star = str(second_shot), 7
+    assert shot_list.folders(scene) == [shot, second_shot] and addon("shot.selection").shot_folder(scene) == second_shot
     assert shot_list.labels(scene) == ["my shot é", "second"]
     props.active_shot = 0
     assert addon("shot.selection").shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
-    assert shot_list.folders(scene) == [shot, other]
+    assert shot_list.folders(scene) == [shot, second_shot]
     props.active_shot = 1
-    assert (props.shot_path, props.t_star, props.run_name) == (str(other), 7, "main")
+    assert (props.shot_path, props.t_star, props.run_name) == (str(second_shot), 7, "main")
     props.active_shot = 99
     assert props.active_shot == 1, "no shot, no change"
 
@@ -109,13 +109,13 @@ def test_keys_move_up_when_a_shot_before_them_goes(addon, two, shot, tmp_path):
     assert props.t_star == 33 and keyed(addon, two) == {"splannequin.t_star": [33.0]}
 
 
-def test_the_chosen_shots_camera_is_the_scenes(addon, two, shot, other):
+def test_the_chosen_shots_camera_is_the_scenes(addon, two, shot, second_shot):
     cameras, props = addon("solve.cameras"), two.splannequin
-    assert two.camera == cameras.find(two, other, "CAMERA")
+    assert two.camera == cameras.find(two, second_shot, "CAMERA")
     props.active_shot = 0
     assert two.camera == cameras.find(two, shot, "CAMERA")
     two.camera = None
-    cameras.remove(two, other)
+    cameras.remove(two, second_shot)
     props.active_shot = 1
     assert two.camera is None, "a shot without a camera here changes nothing"
 
@@ -126,21 +126,21 @@ def seen(scene) -> tuple:
     return size, round(render.fps / render.fps_base, 3), (scene.frame_start, scene.frame_end)
 
 
-def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
+def test_size_rate_and_range_are_stored_per_shot(addon, scene, shot, second_shot):
     """Switching restores the values that the artist left; removing the last shot restores the scene's own values."""
     first, second = ((16, 12, 100), 12.5, (5, 7)), ((32, 24, 100), 25.0, (5, 7))
     original = seen(scene)
     props = scene.splannequin
     for name, change in (("shot.json", {"fps": 25.0}), ("solve/cameras.json", {})):
-        told = json.loads((other / name).read_text()) | change | {"width": 32, "height": 24}
-        (other / name).write_text(json.dumps(told))
+        facts = json.loads((second_shot / name).read_text()) | change | {"width": 32, "height": 24}
+        (second_shot / name).write_text(json.dumps(facts))
     props.shot_path = str(shot)
     addon("solve.arrival").load_camera(scene, shot)
     assert seen(scene) == first
     bpy.ops.splannequin.shot_add()
     assert seen(scene) == first, "nothing of the new one is known"
-    props.shot_path = str(other)
-    addon("solve.arrival").load_camera(scene, other)
+    props.shot_path = str(second_shot)
+    addon("solve.arrival").load_camera(scene, second_shot)
     assert seen(scene) == second
     props.active_shot = 0
     assert seen(scene) == first
@@ -150,54 +150,54 @@ def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
     props.active_shot = 0
     assert seen(scene) == ((16, 12, 50), 12.5, (6, 7))
     bpy.ops.splannequin.shot_remove(things=True)
-    assert seen(scene) == second and scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
-    addon("process.begin").remove_all(scene, other)
+    assert seen(scene) == second and scene.camera == addon("solve.cameras").find(scene, second_shot, "CAMERA")
+    addon("process.begin").remove_all(scene, second_shot)
     assert seen(scene) == original and scene.camera == scene.objects["Camera"]
 
 
-def test_what_the_artist_set_for_a_shot_is_still_the_artists_after_switching(addon, two, shot, other):
+def test_what_the_artist_set_for_a_shot_is_still_the_artists_after_switching(addon, two, shot, second_shot):
     props = two.splannequin
     two.render.resolution_x = 4000
     props.active_shot = 0
     assert two.render.resolution_x == 16
     props.active_shot = 1
     assert two.render.resolution_x == 4000
-    for folder in (shot, other):
+    for folder in (shot, second_shot):
         addon("process.begin").remove_all(two, folder)
     assert two.render.resolution_x == 4000 and two.frame_end == 250
 
 
-def test_a_scene_that_was_left_alone_stays_so_at_switching(addon, scene, shot, other):
+def test_switching_shots_keeps_scene_settings_untouched(addon, scene, shot, second_shot):
     scene.render.resolution_x, scene.frame_end = 640, 99
     props = scene.splannequin
     props.shot_path = str(shot)
     addon("solve.arrival").load_camera(scene, shot)
     bpy.ops.splannequin.shot_add()
-    props.shot_path = str(other)
-    addon("solve.arrival").load_camera(scene, other)
+    props.shot_path = str(second_shot)
+    addon("solve.arrival").load_camera(scene, second_shot)
     scene.frame_end = 50
     props.active_shot = 0
     assert (scene.render.resolution_x, scene.frame_end) == (640, 50)
 
 
-def things(scene) -> set[str]:
+def datablocks(scene) -> set[str]:
     kinds = (bpy.data.objects, bpy.data.meshes, bpy.data.images, bpy.data.actions, bpy.data.collections)
     return {item.name for kind in kinds for item in kind}
 
 
-def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
+def test_removing_one_shot_keeps_the_second(addon, scene, shot, second_shot):
     props = scene.splannequin
     props.shot_path = str(shot)
     addon("solve.arrival").load_camera(scene, shot)
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")
-    before = things(scene)
+    before = datablocks(scene)
     bpy.context.view_layer.update()
     pose = np.array(addon("solve.cameras").find(scene, shot, "CAMERA").matrix_world)
     bpy.ops.splannequin.shot_add()
-    props.shot_path = str(other)
-    addon("solve.arrival").load_camera(scene, other)
+    props.shot_path = str(second_shot)
+    addon("solve.arrival").load_camera(scene, second_shot)
     assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
-    assert things(scene) == before
+    assert datablocks(scene) == before
     assert not len(props.shots) and addon("shot.selection").shot_folder(scene) == shot
     assert scene.camera == addon("solve.cameras").find(scene, shot, "CAMERA")
     bpy.context.view_layer.update()
@@ -210,18 +210,18 @@ def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
     assert scene.render.resolution_x == 1920
 
 
-def test_removing_the_baked_shot_takes_its_group_out(addon, two, shot, other):
+def test_removing_the_baked_shot_takes_its_group_out(addon, two, shot, second_shot):
     addon("process.steps")
-    addon("bake.insertion").insert_freeze(two, other, "freeze")
-    addon("process.begin").remove_all(two, other)
+    addon("bake.insertion").insert_freeze(two, second_shot, "freeze")
+    addon("process.begin").remove_all(two, second_shot)
     assert addon("bake.freeze_group").shown(two) is None and addon("solve.cameras").find(two, shot, "CAMERA")
     assert two.render.resolution_x == 16, "the settings go with the last shot"
 
 
-def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other, new_take):
+def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, second_shot, new_take):
     shots = addon("shot.inventory")
-    addon("bake.insertion").insert_freeze(two, other, "freeze")
-    assert addon("process.steps").STEPS["bake"].view(two, shots.read(other)).done
+    addon("bake.insertion").insert_freeze(two, second_shot, "freeze")
+    assert addon("process.steps").STEPS["bake"].view(two, shots.read(second_shot)).done
     two.splannequin.active_shot = 0
     view = addon("process.steps").STEPS["bake"].view(two, shots.read(shot))
     assert not view.done and "another shot, second" in view.state[0]
@@ -232,14 +232,14 @@ def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other,
     assert "take freeze" in addon("process.steps").STEPS["bake"].view(two, shots.read(shot)).state[0]
 
 
-def test_undo_brings_a_shot_back(addon, two, shot, other):
+def test_undo_brings_a_shot_back(addon, two, shot, second_shot):
     bpy.ops.ed.undo_push(message="two shots")
     assert bpy.ops.splannequin.shot_remove("EXEC_DEFAULT", True) == {"FINISHED"}
     assert addon("shot.selection").folders(bpy.context.scene) == [shot]
     bpy.ops.ed.undo()
     scene = bpy.context.scene
-    assert addon("shot.selection").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
-    assert scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
+    assert addon("shot.selection").folders(scene) == [shot, second_shot] and scene.splannequin.active_shot == 1
+    assert scene.camera == addon("solve.cameras").find(scene, second_shot, "CAMERA")
     scene.splannequin.active_shot = 0
     assert addon("shot.selection").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
 
@@ -257,11 +257,11 @@ def ended(addon, contract, folder, step, kind, params, result):
     return job
 
 
-def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene, shot, other):
+def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene, shot, second_shot):
     props, supervisor, cameras = scene.splannequin, addon("process.job_timer"), addon("solve.cameras")
     props.shot_path, props.t_star = str(shot), 5
     bpy.ops.splannequin.shot_add()
-    props.shot_path, props.t_star = str(other), 7
+    props.shot_path, props.t_star = str(second_shot), 7
     frozen = ended(
         addon,
         contract,
@@ -302,15 +302,15 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
     assert props.shots[1].t_star == 7
 
 
-def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, other):
+def test_camera_file_of_one_shot_does_not_freeze_another(addon, contract, two, shot, second_shot):
     supervisor = addon("process.job_timer")
-    read = addon("freeze.takes").reading(two.session_uid, other, "freeze", iter_path(contract), 1)
-    supervisor.work(other, "freeze", read)
+    read = addon("freeze.takes").reading(two.session_uid, second_shot, "freeze", iter_path(contract), 1)
+    supervisor.work(second_shot, "freeze", read)
     two.splannequin.active_shot = 0
-    while supervisor.watch_of(other).work is not None:
+    while supervisor.watch_of(second_shot).work is not None:
         supervisor.tick()
-    assert "Another shot was chosen" in supervisor.watch_of(other).failures["freeze"][0]
-    assert not (shot / "jobs").exists() and not (other / "jobs").exists()
+    assert "Another shot was chosen" in supervisor.watch_of(second_shot).failures["freeze"][0]
+    assert not (shot / "jobs").exists() and not (second_shot / "jobs").exists()
 
 
 def iter_path(contract):
@@ -318,7 +318,7 @@ def iter_path(contract):
     return contract.CameraPath(8, 8, [])
 
 
-def test_a_dropped_video_begins_a_shot_beside_one_that_was_imported(addon, scene, shot, clip):
+def test_dropped_video_starts_a_second_shot(addon, scene, shot, clip):
     props = scene.splannequin
     props.shot_path = str(shot)
     bpy.ops.splannequin.use_clip(filepath=str(clip))
@@ -347,14 +347,14 @@ def linked(addon, scene, shot, tmp_path):
     return found
 
 
-def test_a_linked_scene_with_the_same_shot_is_left_alone(addon, linked, shot):
+def test_linked_scene_with_the_same_shot_is_not_changed(addon, linked, shot):
     selection, supervisor = addon("shot.selection"), addon("process.job_timer")
-    own = bpy.data.scenes["Comp"]
+    comp_scene = bpy.data.scenes["Comp"]
     assert selection.shot_folder(linked) == shot, "it is the same one"
-    assert selection.scenes_of(shot) == [own] and selection.scenes_with(shot) == [own]
+    assert selection.scenes_of(shot) == [comp_scene] and selection.scenes_with(shot) == [comp_scene]
     camera, watch = linked.camera, supervisor.watch_of(shot)
     supervisor.change(watch, "solve", lambda scene: addon("solve.arrival").load_camera(scene, shot))
-    assert not watch.failures and linked.camera == camera and own.camera not in (None, camera)
+    assert not watch.failures and linked.camera == camera and comp_scene.camera not in (None, camera)
     supervisor.tick()
     assert not watch.failures
 
@@ -385,7 +385,7 @@ def test_a_video_dropped_again_is_the_shot_that_it_was(addon, scene, shot, tmp_p
     assert len(props.shots) == 2 and props.active_shot == 0 and props.clip == f"//{clip.name}"
 
 
-def test_what_two_entries_share_stays_with_the_other(addon, two, shot):
+def test_data_shared_by_two_entries_survives_removal_of_one(addon, two, shot):
     props, cameras = two.splannequin, addon("solve.cameras")
     props.shot_path = str(shot)
     assert addon("shot.selection").folders(two) == [shot, shot]

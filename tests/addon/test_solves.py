@@ -76,16 +76,16 @@ def relative(viewmats) -> np.ndarray:
 
 
 def test_what_blender_tracked_comes_out_as_it_was_filmed(addon, tracked):
-    told = addon("solve.exchange").transforms(tracked)
-    assert [f["file_path"] for f in told["frames"]] == [f"{n}.png" for n in range(101, 101 + FRAMES)]
-    found = opencv([f["transform_matrix"] for f in told["frames"]])
+    transforms = addon("solve.exchange").transforms(tracked)
+    assert [f["file_path"] for f in transforms["frames"]] == [f"{n}.png" for n in range(101, 101 + FRAMES)]
+    found = opencv([f["transform_matrix"] for f in transforms["frames"]])
     np.testing.assert_allclose(relative(found), relative(TRUTH), atol=1e-4)
-    assert (told["w"], told["h"]) == (WIDTH, HEIGHT)
-    assert [told[n] for n in ("fl_x", "fl_y", "cx", "cy")] == pytest.approx([FOCAL, FOCAL, *CENTRE])
-    assert [told[n] for n in ("k1", "k2", "k3")] == pytest.approx([K1, 0.0, 0.0])
+    assert (transforms["w"], transforms["h"]) == (WIDTH, HEIGHT)
+    assert [transforms[n] for n in ("fl_x", "fl_y", "cx", "cy")] == pytest.approx([FOCAL, FOCAL, *CENTRE])
+    assert [transforms[n] for n in ("k1", "k2", "k3")] == pytest.approx([K1, 0.0, 0.0])
 
 
-def test_the_solve_is_asked_for_with_what_was_tracked(addon, tracked, scene, shot):
+def test_tracked_camera_reaches_the_solve_request(addon, tracked, scene, shot):
     listing = shot / "frames" / "frames.json"
     listing.write_text(json.dumps({**json.loads(listing.read_text()), "key": "imported"}))
     props = scene.splannequin
@@ -116,12 +116,12 @@ def test_numbers_are_those_of_the_files(addon, clip):
 def test_pixels_that_are_not_square_have_two_focal_lengths(addon, clip):
     camera = clip.tracking.camera
     camera.units, camera.focal_length_pixels, camera.pixel_aspect = "PIXELS", 300.0, 1.25
-    told = addon("solve.exchange").lens(clip)
-    assert (told["fl_x"], told["fl_y"]) == pytest.approx((300.0, 375.0))
+    lens = addon("solve.exchange").lens(clip)
+    assert (lens["fl_x"], lens["fl_y"]) == pytest.approx((300.0, 375.0))
 
 
 @pytest.mark.parametrize(("model", "name"), [("DIVISION", "division_k1"), ("NUKE", "nuke_k1"), ("BROWN", "brown_p1")])
-def test_other_lens_models_are_refused_unless_they_bend_nothing(addon, contract, clip, model, name):
+def test_unsupported_lens_models_are_refused_unless_undistorted(addon, contract, clip, model, name):
     clip.tracking.camera.distortion_model = model
     assert "k1" not in addon("solve.exchange").lens(clip)
     setattr(clip.tracking.camera, name, 0.01)
@@ -151,8 +151,8 @@ def test_an_st_map_is_handed_on_with_its_way_and_only_where_the_lens_is_ours_to_
     props.shot_path, props.st_map_way, props.st_map_layer = str(shot), "redistort", " back "
     assert solve.params(scene) == contract.SolveParams(), "without a file the rest says nothing"
     props.st_map = str(shot / "x" / ".." / "lens.exr")
-    asked = solve.params(scene)
-    assert (asked.st_map, asked.st_map_way, asked.st_map_layer) == (str(shot / "lens.exr"), "redistort", "back")
+    params = solve.params(scene)
+    assert (params.st_map, params.st_map_way, params.st_map_layer) == (str(shot / "lens.exr"), "redistort", "back")
     props.cameras_from, props.cameras_path = "FILE", str(shot / "model")
     assert solve.params(scene).st_map == "", "imported cameras already have a lens"
 
@@ -176,10 +176,10 @@ def test_the_export_button_writes_every_camera(scene, shot, tmp_path, contract, 
         ]  # fmt: skip
         assert sum(not line.startswith("#") for line in (out / "points3D.txt").read_text().splitlines()) == 20
     if kind == "nerfstudio":
-        told = json.loads((out / "transforms.json").read_text())
-        found = opencv([f["transform_matrix"] for f in told["frames"]])
+        transforms = json.loads((out / "transforms.json").read_text())
+        found = opencv([f["transform_matrix"] for f in transforms["frames"]])
         np.testing.assert_allclose(found, np.reshape([f.viewmat for f in path.frames], (-1, 4, 4)), atol=1e-9)
-        assert all((out / f["file_path"]).is_file() for f in told["frames"])
+        assert all((out / f["file_path"]).is_file() for f in transforms["frames"])
 
 
 def test_the_export_button_says_what_is_wrong(scene, shot, tmp_path):
@@ -195,19 +195,19 @@ def test_the_export_button_says_what_is_wrong(scene, shot, tmp_path):
 def test_an_export_in_a_window_is_followed_without_waiting(addon, contract, scene, shot, tmp_path, well):
     solves, supervisor = addon("solve.exchange"), addon("process.job_timer")
     scene.splannequin.shot_path = str(shot)
-    asked = solves.begin_export(contract.ExportWords(str(shot if well else tmp_path), output=str(tmp_path / "out")))
-    told = addon("solve.operators").tell
-    supervisor.when_answered(asked, lambda: told(shot, lambda: [solves.exported(asked, tmp_path / "out")]))
+    question = solves.begin_export(contract.ExportWords(str(shot if well else tmp_path), output=str(tmp_path / "out")))
+    tell = addon("solve.operators").tell
+    supervisor.when_answered(question, lambda: tell(shot, lambda: [solves.exported(question, tmp_path / "out")]))
     supervisor.tick()
     watch = supervisor.watch_of(shot)
     assert not watch.notes and not watch.failures
-    asked.wait(60)
+    question.wait(60)
     supervisor.tick()
     said = watch.notes["solve"][0] if well else watch.failures["solve"][0]
     assert (str(tmp_path / "out") if well else "is not a shot folder") in said
 
 
-def test_export_and_given_cameras_from_the_command_line(addon, shot, tmp_path, capfd):
+def test_command_line_exports_and_imports_cameras(addon, shot, tmp_path, capfd):
     main = addon("command_line.headless").main
     assert main(["export", str(shot), "--format", "nerfstudio", "--output", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "transforms.json").is_file()
@@ -225,13 +225,13 @@ def test_alembic_carries_the_camera(addon, scene, shot, tmp_path):
     bpy.ops.splannequin.load_camera()
 
     def state(camera):
-        told = []
+        states = []
         for frame in (5, 6, 7):
             bpy.context.scene.frame_set(frame)
             graph = bpy.context.evaluated_depsgraph_get()
             seen = camera.evaluated_get(graph)
-            told.append(np.concatenate([np.array(seen.matrix_world.normalized()).ravel(), [seen.data.angle_x]]))
-        return np.array(told)
+            states.append(np.concatenate([np.array(seen.matrix_world.normalized()).ravel(), [seen.data.angle_x]]))
+        return np.array(states)
 
     before = state(scene.camera)
     assert np.abs(before[0] - before[2]).max() > 0.05

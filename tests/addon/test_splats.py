@@ -51,21 +51,21 @@ def stood(scene, shot, addon):
 
 def placed_take(shot: Path, addon, scene, matrix=None) -> dict:
     """Take `freeze` with splats in the current placement, or in the placement `matrix`."""
-    told = addon("shot.placement").placement_in(scene, shot).to_json()
+    placement = addon("shot.placement").placement_in(scene, shot).to_json()
     if matrix is not None:
-        told["scene_from_solve"] = np.asarray(matrix, float).ravel().tolist()
-    write_ply(shot / "takes/freeze/frozen.ply", splats(np.reshape(told["scene_from_solve"], (4, 4))))
+        placement["scene_from_solve"] = np.asarray(matrix, float).ravel().tolist()
+    write_ply(shot / "takes/freeze/frozen.ply", splats(np.reshape(placement["scene_from_solve"], (4, 4))))
     path = shot / "takes/freeze/take.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "placement": told}))
+    path.write_text(json.dumps({**json.loads(path.read_text()), "placement": placement}))
     addon("process.job_timer").watch_of(shot).state = addon("shot.inventory").read(shot)
-    return told
+    return placement
 
 
 def pixels_in_solve(shot: Path, frame: int, contract) -> np.ndarray:
     """Projection of `points` by the solve's camera, [P, 2], float64."""
     path = contract.CameraPath.load(shot / "solve/cameras.json")
-    one = next(f for f in path.frames if f.frame == frame)
-    viewmat, (fx, fy, cx, cy) = np.reshape(one.viewmat, (4, 4)), one.K
+    splats = next(f for f in path.frames if f.frame == frame)
+    viewmat, (fx, fy, cx, cy) = np.reshape(splats.viewmat, (4, 4)), splats.K
     seen = points() @ viewmat[:3, :3].T + viewmat[:3, 3]
     return np.stack([fx * seen[:, 0] / seen[:, 2] + cx, fy * seen[:, 1] / seen[:, 2] + cy], 1)
 
@@ -80,10 +80,10 @@ def pixels_in_blender(scene, camera, places, size) -> np.ndarray:
 def test_the_root_is_the_placement(scene, shot, stood, addon, contract):
     scene.unit_settings.scale_length = 0.01
     addon("shot.placement").write(scene, shot)
-    told = contract.Placement.load(shot / "placement.json")
-    np.testing.assert_allclose(np.reshape(told.scene_from_solve, (4, 4)), np.array(stood.matrix_world), atol=1e-5)
-    assert told.metres_per_unit == pytest.approx(0.01)
-    assert told.solve == contract.file_digest(shot / "solve/cameras.json")
+    placement = contract.Placement.load(shot / "placement.json")
+    np.testing.assert_allclose(np.reshape(placement.scene_from_solve, (4, 4)), np.array(stood.matrix_world), atol=1e-5)
+    assert placement.metres_per_unit == pytest.approx(0.01)
+    assert placement.solve == contract.file_digest(shot / "solve/cameras.json")
     stood.scale.x *= 1.5
     bpy.context.view_layer.update()
     stretched = addon("shot.placement").placement_in(scene, shot)
@@ -123,10 +123,10 @@ def test_splats_follow_a_shot_that_is_moved_later(scene, shot, stood, addon, con
 
 def test_what_a_splat_carries(scene, shot, stood, addon):
     """Compared with the file in float64: linear colour, opacity, standard deviations, unit quaternions."""
-    told = placed_take(shot, addon, scene)
+    placement = placed_take(shot, addon, scene)
     bpy.ops.splannequin.add_splats()
     item = addon("freeze.splats").find(scene, shot, "freeze")
-    rows = splats(np.reshape(told["scene_from_solve"], (4, 4))).astype(np.float32).astype(np.float64)
+    rows = splats(np.reshape(placement["scene_from_solve"], (4, 4))).astype(np.float32).astype(np.float64)
 
     def values(name: str, field: str, width: int) -> np.ndarray:
         data = item.data.attributes[name].data
@@ -181,8 +181,8 @@ def test_one_object_a_take(scene, shot, stood, addon, new_take):
 def test_splats_go_with_the_shot(scene, shot, stood, addon):
     placed_take(shot, addon, scene)
     bpy.ops.splannequin.add_splats()
-    told = addon("process.begin").remove_all(scene, shot)
-    assert "Splats were removed." in told
+    message = addon("process.begin").remove_all(scene, shot)
+    assert "Splats were removed." in message
     assert not [b for kind in (bpy.data.objects, bpy.data.meshes) for b in kind if "splats" in b.name]
 
 
@@ -213,7 +213,7 @@ def test_what_cannot_be_added_is_said(scene, shot, stood, addon, contract):
     assert not [m for m in bpy.data.meshes if "splats" in m.name], "nothing half-made stays"
 
 
-def test_the_buttons_hand_on_where_the_shot_stands(scene, shot, stood, addon, tmp_path):
+def test_splat_buttons_pass_the_shot_placement(scene, shot, stood, addon, tmp_path):
     """Camera for Nuke, exported by the button: positions of Blender's camera, converted to y up."""
     out = tmp_path / "out"
     assert bpy.ops.splannequin.export_cameras(directory=str(out), format="chan") == {"FINISHED"}
@@ -225,7 +225,7 @@ def test_the_buttons_hand_on_where_the_shot_stands(scene, shot, stood, addon, tm
         assert np.radians(row[7]) == pytest.approx(2 * np.arctan(12 / 2 / 20.0), abs=1e-6)
 
 
-def test_blenders_own_importer_reads_a_ply_that_lies_on_the_camera(scene, shot, stood, addon, contract):
+def test_blender_importer_aligns_a_ply_with_the_camera(scene, shot, stood, addon, contract):
     """frozen.ply is in the scene's axes and units, so no rotation is needed."""
     placed_take(shot, addon, scene)
     known = set(bpy.data.objects)
@@ -282,8 +282,8 @@ def test_where_blenders_importer_reads_splats_it_is_used(scene, shot, stood, add
     used."""
     if "import_points" not in addon("compat").usd_import_options():
         pytest.skip("this Blender reads no points from USD")
-    told = placed_take(shot, addon, scene)
-    places = splats(np.reshape(told["scene_from_solve"], (4, 4)))[:, :3].tolist() if reads else []
+    placement = placed_take(shot, addon, scene)
+    places = splats(np.reshape(placement["scene_from_solve"], (4, 4)))[:, :3].tolist() if reads else []
     in_backend(addon, root, POINTS, str(shot / "takes/freeze/frozen.usdc"), json.dumps(places))
     monkeypatch.setattr(addon("compat"), "splat_import_option", lambda: "import_points")
     known = {o.name for o in scene.objects}
@@ -301,9 +301,7 @@ def test_where_blenders_importer_reads_splats_it_is_used(scene, shot, stood, add
 
 
 @pytest.mark.parametrize("metres", [1.0, 0.01])
-def test_blenders_own_importer_brings_the_camera_back_to_where_it_is(
-    scene, shot, stood, addon, contract, root, tmp_path, metres
-):
+def test_blender_importer_restores_the_camera_pose(scene, shot, stood, addon, contract, root, tmp_path, metres):
     """Blender reads the backend's USD stage with the same pose, lens and offsets on every frame."""
     if not addon("compat").usd_import_options():
         pytest.skip("this Blender reads no USD")
@@ -318,9 +316,9 @@ def test_blenders_own_importer_brings_the_camera_back_to_where_it_is(
     (camera,) = [o for o in set(bpy.data.objects) - known if o.type == "CAMERA"]
     for frame in (5, 6, 7):
         scene.frame_set(frame)
-        one, other = ours.evaluated_get(bpy.context.evaluated_depsgraph_get()), camera
+        splats, expected = ours.evaluated_get(bpy.context.evaluated_depsgraph_get()), camera
         np.testing.assert_allclose(
-            np.array(other.matrix_world.translation), np.array(one.matrix_world.translation), atol=1e-4
+            np.array(expected.matrix_world.translation), np.array(splats.matrix_world.translation), atol=1e-4
         )
         places = [stood.matrix_world @ Vector(p) for p in points()]
         found = pixels_in_blender(scene, camera, places, (16, 12))

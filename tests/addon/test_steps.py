@@ -40,7 +40,7 @@ def test_an_import_with_a_start_counts_from_it(addon, scene, clip, tmp_path):
     assert (scene.frame_start, scene.frame_end) == (1001, 1008) and 1001 <= props.t_star <= 1008
 
 
-def test_a_scene_in_use_is_left_alone_without_consent(addon, scene, shot):
+def test_scene_in_use_changes_only_with_consent(addon, scene, shot):
     scene.render.resolution_x, scene.frame_end = 4096, 99
     said = addon("footage.arrival").imported(scene, shot)
     assert (scene.render.resolution_x, scene.frame_end) == (4096, 99) and "not changed" in said[0]
@@ -54,7 +54,7 @@ def test_no_clip_is_said_in_words(scene):
         bpy.ops.splannequin.import_clip()
 
 
-def test_a_shot_opened_by_its_folder_is_imported_again_from_its_own_clip(addon, with_shot, shot, contract):
+def test_shot_opened_by_folder_reimports_its_stored_clip(addon, with_shot, shot, contract):
     source = str(shot.parent / "clip.mp4")
     contract.write_json(shot / "shot.json", {**contract.read_json(shot / "shot.json"), "source": source})
     assert not with_shot.splannequin.clip
@@ -75,7 +75,7 @@ def test_a_folder_of_no_shot_is_refused(scene, tmp_path):
         bpy.ops.splannequin.solve_camera()
 
 
-def test_an_artists_own_folder_is_not_filled(scene, clip, tmp_path):
+def test_existing_artist_folder_is_not_used_as_a_shot(scene, clip, tmp_path):
     mine = tmp_path / "project"
     mine.mkdir()
     (mine / "scene.blend").write_bytes(b"BLENDER")
@@ -85,7 +85,7 @@ def test_an_artists_own_folder_is_not_filled(scene, clip, tmp_path):
     assert [p.name for p in mine.iterdir()] == ["scene.blend"]
 
 
-def test_the_shot_folder_stands_beside_the_clip(addon, scene, tmp_path):
+def test_shot_folder_is_created_next_to_the_clip(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a clip.mov")
     assert addon("shot.selection").shot_folder(scene) == tmp_path / "a clip.splannequin"
 
@@ -122,7 +122,7 @@ def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, sh
     assert not any(map(lambda key: key.startswith("splannequin_"), scene.keys()))
 
 
-def test_colours_are_left_alone_without_consent(with_shot):
+def test_view_settings_change_only_with_consent(with_shot):
     with_shot.splannequin.keep_colours = False
     bpy.ops.splannequin.insert_freeze()
     assert with_shot.view_settings.view_transform == "AgX"
@@ -148,13 +148,13 @@ def test_the_artists_output_path_is_kept(addon, with_shot, shot, tmp_path):
     assert with_shot.render.filepath == str(tmp_path / "mine_")
 
 
-def test_t_star_is_held_within_the_clip(with_shot):
+def test_t_star_is_clamped_to_the_clip(with_shot):
     with_shot.frame_set(200)
     bpy.ops.splannequin.t_star_here()
     assert with_shot.splannequin.t_star == 7 and with_shot.splannequin.choose_t_star
 
 
-def test_bake_asks_for_the_take_as_it_was_made(addon, with_shot):
+def test_bake_requests_the_take_with_its_stored_parameters(addon, with_shot):
     params = addon("process.steps").STEPS["bake"].params(with_shot)
     assert (params.run, params.take, params.t_star, params.width, params.only_missing) == (
         "main",
@@ -241,13 +241,13 @@ def test_no_button_meets_a_newer_or_damaged_shot_with_a_traceback(scene, shot, t
         (shot / "shot.json").write_text(text)
         assert not bpy.ops.splannequin.export_for_farm.poll()
         for name in ("bake", "freeze", "solve_camera", "train", "import_clip"):
-            with pytest.raises(RuntimeError) as told:
+            with pytest.raises(RuntimeError) as error:
                 getattr(bpy.ops.splannequin, name)()
-            assert "Traceback" not in str(told.value), name
+            assert "Traceback" not in str(error.value), name
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_broken_points_are_told_in_a_sentence(addon, scene, shot):
+def test_damaged_points_give_a_readable_error(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
     points = shot / "solve" / "points.npz"
     whole = points.read_bytes()
@@ -255,16 +255,16 @@ def test_broken_points_are_told_in_a_sentence(addon, scene, shot):
     np.savez(archive, other=np.zeros(3))
     for data in (whole[: len(whole) // 2], b"", b"no archive", archive.getvalue()):
         points.write_bytes(data)
-        with pytest.raises(RuntimeError) as told:
+        with pytest.raises(RuntimeError) as error:
             bpy.ops.splannequin.load_camera()
-        assert str(told.value).strip() == f"Error: {points} is damaged. Solve again."
+        assert str(error.value).strip() == f"Error: {points} is damaged. Solve again."
     german = addon("translations").translate(f"{points} is damaged. Solve again.", "de_DE")
     assert german == f"{points} ist beschädigt. Die Kamera neu lösen."
     points.write_bytes(whole)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
 
 
-def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_path):
+def test_second_clip_gets_a_separate_shot_folder(addon, scene, clip, tmp_path):
     props = scene.splannequin
     props.use_range, props.first, props.last = True, 1, 8
     for name in ("first.mp4", "second.mp4"):
@@ -327,20 +327,20 @@ def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_wi
     imported(addon, a_few, clip, tmp_path / "A" / "shot.mp4")
     assert not replaces(a_few), "the same clip again"
     props.clip = str(tmp_path / "B" / "shot.mp4")
-    told = replaces(a_few)
-    assert told.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}. Its frames")
-    assert addon("translations").translate(told, "de_DE").startswith("own.splannequin ist der Shot von ")
+    question = replaces(a_few)
+    assert question.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}. Its frames")
+    assert addon("translations").translate(question, "de_DE").startswith("own.splannequin ist der Shot von ")
     props.clip = ""
     assert not replaces(a_few), "its own clip is taken"
 
 
-def test_work_on_a_shot_is_replaced_with_consent_alone(addon, a_few, clip, tmp_path):
+def test_shot_work_is_replaced_only_with_consent(addon, a_few, clip, tmp_path):
     """The clip is another one of the same name, which the panel cannot detect. The panel asks; the backend refuses."""
     folder = imported(addon, a_few, clip, tmp_path / "a.mp4")
     (folder / "solve").mkdir()
     (folder / "solve" / "cameras.json").write_text("{}")
-    told = addon("footage.operators").replaces(a_few)
-    assert "a solved camera" in told and "gelöste Kamera" in addon("translations").translate(told, "de_DE")
+    question = addon("footage.operators").replaces(a_few)
+    assert "a solved camera" in question and "gelöste Kamera" in addon("translations").translate(question, "de_DE")
     a_few.splannequin.use_range, a_few.splannequin.first, a_few.splannequin.last = True, 3, 12
     with pytest.raises(RuntimeError, match="--replace"):
         bpy.ops.splannequin.import_clip()
@@ -359,7 +359,7 @@ def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, sh
     assert addon("process.job_timer").watch_of(shot).running() is None
 
 
-def test_bake_asks_for_a_ramp_or_a_path_as_it_was_made(addon, shot):
+def test_bake_requests_ramp_or_path_as_stored(addon, shot):
     path = shot / "takes" / "freeze" / "take.json"
     facts = json.loads(path.read_text())
     ramp = {"5": 5.0, "6": 5.5}
@@ -381,7 +381,7 @@ def test_a_step_is_refused_while_another_of_the_shot_runs(addon, contract, scene
     assert len(list((tmp_path / "t.splannequin" / "jobs").iterdir())) == 1
 
 
-def test_a_job_found_again_belongs_to_the_step_that_asked_for_it(addon, contract, shot):
+def test_rediscovered_job_belongs_to_its_step(addon, contract, shot):
     jobs, steps = addon("process.jobs"), addon("process.steps")
     job = jobs.new_job(shot, "freeze", contract.FreezeParams())
     assert steps.step_of(job) == "freeze", "a job of the backend's own command line names no step"
@@ -441,9 +441,9 @@ def test_marker_and_instant_follow_whichever_changed_last(addon, with_shot, shot
     scene.name = "renamed"
     marker.frame = 7
     assert markers.follow(scene) and scene.splannequin.t_star == 7, "known by another name"
-    other = scene.timeline_markers.new("mine", frame=3)
+    artists_marker = scene.timeline_markers.new("mine", frame=3)
     assert "The marker t* was removed." in addon("process.begin").remove_all(scene, shot)
-    assert list(scene.timeline_markers) == [other]
+    assert list(scene.timeline_markers) == [artists_marker]
 
 
 def test_what_the_artist_changed_since_is_not_taken_back(addon, scene, shot):
@@ -461,7 +461,7 @@ def test_what_the_artist_changed_since_is_not_taken_back(addon, scene, shot):
     assert not [key for key in scene.keys() if key.startswith("splannequin_")]  # noqa: SIM118
 
 
-def test_a_look_that_was_chosen_is_asked_for(addon, scene, clip, tmp_path):
+def test_chosen_look_reaches_the_request(addon, scene, clip, tmp_path):
     look = tmp_path / "camera.cube"
     look.write_text("LUT_3D_SIZE 2\n" + "".join(f"{r} {g} {b}\n" for b in (0, 1) for g in (0, 1) for r in (0, 1)))
     scene.splannequin.clip, scene.splannequin.lut = str(clip), str(look)

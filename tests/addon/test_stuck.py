@@ -75,17 +75,17 @@ def test_the_log_that_is_offered_has_something_in_it(addon, contract, shot, with
     assert steps["solve"].log(job) == shot / "solve" / "colmap.log"
     (job.folder / "log.txt").write_text("what the backend said")
     assert steps["solve"].log(job) == job.folder / "log.txt"
-    other = addon("process.jobs").new_job(shot, "train", contract.TrainParams())
-    assert steps["train"].log(other) is None
+    train_job = addon("process.jobs").new_job(shot, "train", contract.TrainParams())
+    assert steps["train"].log(train_job) is None
 
 
 def test_which_frames_are_solved_is_a_setting(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a.mp4")
-    asked = addon("process.steps").STEPS["import"].params(scene)
-    assert (asked.step, asked.fps) == (0, 0.0)
+    params = addon("process.steps").STEPS["import"].params(scene)
+    assert (params.step, params.fps) == (0, 0.0)
     scene.splannequin.solve_step, scene.splannequin.fps = 3, 25.0
-    asked = addon("process.steps").STEPS["import"].params(scene)
-    assert (asked.step, asked.fps) == (3, 25.0)
+    params = addon("process.steps").STEPS["import"].params(scene)
+    assert (params.step, params.fps) == (3, 25.0)
 
 
 def test_the_rate_of_a_sequence_is_the_one_that_was_set(addon, scene, tmp_path, pictures):
@@ -100,30 +100,30 @@ def test_the_rate_of_a_sequence_is_the_one_that_was_set(addon, scene, tmp_path, 
     assert addon("shot.inventory").read(addon("shot.selection").shot_folder(scene)).info["fps"] == 30.0
 
 
-def test_the_colour_space_that_was_named_is_asked_for(addon, scene, tmp_path):
+def test_named_colour_space_reaches_the_request(addon, scene, tmp_path):
     scene.splannequin.clip, scene.splannequin.colour_space = str(tmp_path / "a.mp4"), " ARRI LogC3 (EI800) "
-    asked = addon("process.steps").STEPS["import"].params(scene)
-    assert asked.colour_space == "ARRI LogC3 (EI800)"
+    params = addon("process.steps").STEPS["import"].params(scene)
+    assert params.colour_space == "ARRI LogC3 (EI800)"
 
 
-def test_what_a_person_says_of_the_footage_is_asked_for(addon, scene, tmp_path):
+def test_manual_footage_settings_reach_the_request(addon, scene, tmp_path):
     props = scene.splannequin
     props.clip = str(tmp_path / "a.mp4")
     plain = addon("process.steps").STEPS["import"].params(scene)
     assert (plain.layer, plain.pixel_aspect, plain.matrix, plain.levels) == ("", 0.0, "auto", "auto")
     props.layer, props.pixel_aspect, props.matrix, props.levels = " left ", 1.333, "bt601", "full"
-    asked = addon("process.steps").STEPS["import"].params(scene)
-    assert (asked.layer, asked.pixel_aspect, asked.matrix, asked.levels) == ("left", 1.333, "bt601", "full")
+    params = addon("process.steps").STEPS["import"].params(scene)
+    assert (params.layer, params.pixel_aspect, params.matrix, params.levels) == ("left", 1.333, "bt601", "full")
 
 
 def test_the_panel_says_how_the_footage_was_read(addon, with_shot):
     shot = addon("shot.selection").shot_folder(with_shot)
     listing = shot / "frames" / "frames.json"
-    told = json.loads(listing.read_text())
-    told["read_as"] = ["Read as 64 x 48, 24 fps.", 7, "Assumed, for the footage does not say: matrix."]
-    listing.write_text(json.dumps(told))
+    frames_record = json.loads(listing.read_text())
+    frames_record["read_as"] = ["Read as 64 x 48, 24 fps.", 7, "Assumed, for the footage does not say: matrix."]
+    listing.write_text(json.dumps(frames_record))
     view = addon("process.steps").STEPS["import"].view(with_shot, addon("shot.inventory").read(shot))
-    assert view.state[-2:] == [told["read_as"][0], told["read_as"][2]]
+    assert view.state[-2:] == [frames_record["read_as"][0], frames_record["read_as"][2]]
 
 
 def test_after_the_import_the_clip_is_seen_and_nothing_else_is_touched(addon, with_shot, with_raw):
@@ -184,7 +184,7 @@ def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
     monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
 
 
-def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp_path):
+def test_interrupted_environment_is_not_accepted(addon, contract, monkeypatch, tmp_path):
     """Set-up was cancelled, or Blender was closed during it: the interpreter exists, the packages do not."""
     backend = addon("process.backend")
     monkeypatch.delenv("SPLANNEQUIN_BACKEND_PYTHON", raising=False)

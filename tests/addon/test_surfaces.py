@@ -39,8 +39,8 @@ def stood(scene, shot, addon, contract):
     root.matrix_world = Matrix.LocRotScale(Vector((3, -2, 1)), Matrix.Rotation(0.7, 3, "X"), Vector((2.5,) * 3))
     bpy.context.view_layer.update()
     facts = shot / "takes/freeze/take.json"
-    told = addon("shot.placement").placement_in(scene, shot).to_json()
-    facts.write_text(json.dumps({**json.loads(facts.read_text()), "placement": told}))
+    placement = addon("shot.placement").placement_in(scene, shot).to_json()
+    facts.write_text(json.dumps({**json.loads(facts.read_text()), "placement": placement}))
     write_surface(shot, contract)
     addon("process.job_timer").watch_of(shot).state = addon("shot.inventory").read(shot)
     return root
@@ -55,7 +55,7 @@ def corners(item):
     return np.array([item.matrix_world @ v.co for v in item.data.vertices])
 
 
-def test_it_stands_where_it_left_for_and_follows_the_root(scene, shot, stood, addon):
+def test_surface_keeps_its_place_and_follows_the_root(scene, shot, stood, addon):
     assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
     room, people = found(addon, scene, shot)
     np.testing.assert_allclose(corners(room), FLOOR, atol=1e-5)
@@ -68,7 +68,7 @@ def test_it_stands_where_it_left_for_and_follows_the_root(scene, shot, stood, ad
     np.testing.assert_allclose(corners(room), FLOOR + np.array([1, 0, 0]), atol=1e-5)
 
 
-def test_added_again_it_is_replaced_and_remove_shot_takes_it_away(scene, shot, stood, addon):
+def test_surface_is_replaced_on_reinsert_and_removed_with_the_shot(scene, shot, stood, addon):
     for _ in range(2):
         assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
     assert len(found(addon, scene, shot)) == 2 and len(bpy.data.meshes) <= 4
@@ -76,7 +76,7 @@ def test_added_again_it_is_replaced_and_remove_shot_takes_it_away(scene, shot, s
     assert not [o for o in bpy.data.objects if o.type == "MESH" and o.is_shadow_catcher]
 
 
-def test_the_timer_brings_in_what_a_job_made(scene, shot, stood, addon):
+def test_timer_inserts_a_finished_surface(scene, shot, stood, addon):
     timer, job = addon("process.job_timer"), addon("process.jobs").Job(shot / "jobs" / "x", "surface", {})
     job.result = {"take": "freeze"}
     assert addon("process.steps").STEPS["freeze"].arrive(scene, job)
@@ -88,7 +88,7 @@ def test_the_timer_brings_in_what_a_job_made(scene, shot, stood, addon):
     assert timer.watch_of(shot).notes["freeze"] and not timer.watch_of(shot).failures
 
 
-def test_undo_takes_it_away_and_redo_brings_it_back(scene, shot, stood, addon):
+def test_undo_removes_it_and_redo_restores_it(scene, shot, stood, addon):
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
     bpy.ops.ed.undo_push(message="added")
@@ -106,19 +106,19 @@ def test_what_the_artist_deletes_is_let_go(scene, shot, stood, addon):
     assert len(addon("shot.scene_objects").of(scene, shot).surfaces) == 1
 
 
-def test_two_shots_of_a_file_have_their_own(scene, shot, stood, addon, contract, tmp_path):
+def test_two_shots_of_a_file_have_separate_surfaces(scene, shot, stood, addon, contract, tmp_path):
     bpy.ops.splannequin.add_surface()
-    other = tmp_path / "other.splannequin"
-    shutil.copytree(shot, other)
-    scene.splannequin.shot_path = str(other)
+    second_shot = tmp_path / "other.splannequin"
+    shutil.copytree(shot, second_shot)
+    scene.splannequin.shot_path = str(second_shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
-    write_surface(other, contract)
-    addon("process.job_timer").watch_of(other).state = addon("shot.inventory").read(other)
+    write_surface(second_shot, contract)
+    addon("process.job_timer").watch_of(second_shot).state = addon("shot.inventory").read(second_shot)
     assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
-    first, second = found(addon, scene, shot), found(addon, scene, other)
+    first, second = found(addon, scene, shot), found(addon, scene, second_shot)
     assert len(first) == len(second) == 2 and not set(first) & set(second)
-    addon("freeze.surfaces").remove(scene, other)
-    assert len(found(addon, scene, shot)) == 2 and not found(addon, scene, other)
+    addon("freeze.surfaces").remove(scene, second_shot)
+    assert len(found(addon, scene, shot)) == 2 and not found(addon, scene, second_shot)
 
 
 def test_a_render_has_the_shadow_and_what_is_behind_people_is_hidden(scene, shot, stood, addon, tmp_path):
@@ -160,7 +160,7 @@ def test_what_cannot_be_added_is_a_sentence(scene, shot, stood, addon, contract)
         addon("shot.scene_objects").check_root(scene, shot)
 
 
-def test_the_button_has_it_made_and_brings_it_in(scene, addon, frozen_world):
+def test_button_requests_and_inserts_the_surface(scene, addon, frozen_world):
     shot = frozen_world / "tiny.splannequin"
     scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), "freeze"
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}

@@ -55,14 +55,14 @@ def test_what_is_rendered_tells_it_and_removal_takes_it_back(addon, dated, tmp_p
     assert (scene.render.use_stamp_note, scene.render.stamp_note_text) == (False, "")
 
 
-def test_a_note_of_the_artists_own_stays(addon, dated):
+def test_artist_note_is_kept(addon, dated):
     scene, shot = dated("01:00:00:10")
     scene.render.stamp_note_text = "graded by Kim"
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     assert (scene.render.use_stamp_note, scene.render.stamp_note_text) == (False, "graded by Kim")
 
 
-def test_footage_without_one_takes_the_note_of_other_footage_away(addon, dated):
+def test_footage_without_timecode_removes_the_old_note(addon, dated):
     scene, shot = dated("01:00:00:10")
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     dated("")

@@ -136,11 +136,11 @@ def languages(addon) -> dict[str, dict[str, str]]:
 
 
 def test_every_language_has_what_is_shown_and_nothing_else(addon, shown, root):
-    there = written(root)
+    in_source = written(root)
     for locale, messages in languages(addon).items():
         missing = "\n".join(f"    {text!r}: {''!r},  # {shown[text]}" for text in shown if text not in messages)
         assert not missing, f"paste into splannequin_addon/translations/{locale}.py and translate:\n{missing}\n"
-        extra = "\n".join(repr(text) for text in messages if text not in shown and text not in there)
+        extra = "\n".join(repr(text) for text in messages if text not in shown and text not in in_source)
         assert not extra, f"nothing shows these any more, take them out of translations/{locale}.py:\n{extra}\n"
 
 

@@ -39,7 +39,7 @@ BEFORE = {
     "save_motion": ("paint_motion",),
 }
 """Operators that must run before another."""
-ELSEWHERE = {
+TESTED_IN = {
     "freeze_as_warp": "test_layers.py",  # needs a take of plate-based frames
     "suggested_instant": "needs a live session; it sets what t_star_here sets",
     "use_movie_clip": "needs an editor of clips; it calls use_clip",
@@ -60,7 +60,7 @@ NAMES = (
 
 
 def test_no_operator_is_left_out(addon):
-    assert undoable(addon) == {*NAMES, *ELSEWHERE}
+    assert undoable(addon) == {*NAMES, *TESTED_IN}
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ def add(path, **more):
     path.write_text(json.dumps(json.loads(path.read_text()) | more))
 
 
-def test_a_verdict_stands_once_a_runs_under_train_and_a_takes_under_freeze(addon, with_shot, shot):
+def test_run_verdict_is_under_train_and_take_verdict_under_freeze(addon, with_shot, shot):
     shots = addon("shot.inventory")
     add(shot / "runs" / "main" / "summary.json", verdict=RUN)
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE, detail={"plate_share": 0.98})
@@ -51,14 +51,14 @@ def test_a_damaged_verdict_is_left_out(addon, with_shot, shot, damaged):
     assert len(addon("process.steps").STEPS["freeze"].view(with_shot, state).state) == 2
 
 
-def test_what_the_verdict_tells_is_not_told_twice(addon):
+def test_verdict_does_not_repeat_warnings(addon):
     new_warnings = addon("ui.step_panel").new_warnings
     warnings = [("Poor. It does not hold.", "Solve again."), ("Something else.", "")]
     assert new_warnings(warnings, ["Run main", "Poor. It does not hold."]) == ["Something else."]
     assert new_warnings(warnings, []) == ["Poor. It does not hold. Solve again.", "Something else."]
 
 
-def test_verdicts_are_told_in_german(addon):
+def test_verdicts_are_translated_to_german(addon):
     said = addon("translations").translate
     assert said("Fair. It does not hold in frames 10 to 31, lower left.", "de_DE") == (
         "Brauchbar. Es hält nicht in den Bildern 10 bis 31, unten links."
@@ -73,7 +73,7 @@ def test_verdicts_are_told_in_german(addon):
     assert said("Mostly a guess in frame 7, middle.", "de_DE") == "Meist geraten in Bild 7, Mitte."
 
 
-def test_detail_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
+def test_detail_setting_reaches_freeze_and_bake_keeps_the_take_value(addon, with_shot, shot):
     steps = addon("process.steps")
     assert steps.STEPS["freeze"].params(with_shot).detail == "on"
     with_shot.splannequin.detail = False
@@ -85,13 +85,13 @@ def test_detail_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon,
     assert steps.STEPS["bake"].params(with_shot).detail == "on"
 
 
-def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
+def test_develop_setting_reaches_freeze_and_bake_keeps_the_take_value(addon, with_shot, shot):
     steps, props, take = addon("process.steps"), with_shot.splannequin, shot / "takes" / "freeze" / "take.json"
-    asked = []
+    requests = []
     for wanted in (True, False):
         props.develop = wanted
-        asked.append(steps.STEPS["freeze"].params(with_shot).develop)
-    assert asked == ["on", "off"]
+        requests.append(steps.STEPS["freeze"].params(with_shot).develop)
+    assert requests == ["on", "off"]
     props.develop = True
     assert steps.STEPS["bake"].params(with_shot).develop == "off", "its frames are of before instants were developed"
     props.develop = False

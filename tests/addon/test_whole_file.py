@@ -14,7 +14,7 @@ from mathutils import Vector
 from tests.addon.data.pixels import read
 
 
-def beside(name: str) -> types.ModuleType:
+def load_sibling(name: str) -> types.ModuleType:
     """Import a test file of this folder by path for its helpers; a plain import does not work inside Blender."""
     spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
     module = importlib.util.module_from_spec(spec)
@@ -22,7 +22,7 @@ def beside(name: str) -> types.ModuleType:
     return module
 
 
-test_lights, test_splats, test_surfaces = (beside(f"test_{name}") for name in ("lights", "splats", "surfaces"))
+test_lights, test_splats, test_surfaces = (load_sibling(f"test_{name}") for name in ("lights", "splats", "surfaces"))
 
 
 @pytest.fixture
@@ -65,8 +65,8 @@ def test_moved_and_without_the_addon_it_renders_as_before(full, scene, addon, pa
     scene.render.image_settings.file_format = "OPEN_EXR"
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "artist.blend"))
     bring_in(scene, full, addon)
-    ahead = scene.camera.matrix_world @ Vector((0.0, 0.0, -2.0))
-    bpy.ops.mesh.primitive_cube_add(size=0.4, location=ahead)
+    target = scene.camera.matrix_world @ Vector((0.0, 0.0, -2.0))
+    bpy.ops.mesh.primitive_cube_add(size=0.4, location=target)
     addon("bake.freeze_group").cg_softness(scene).default_value = 0.5
     before = rendered(tmp_path / "before.exr")
     bpy.ops.wm.save_mainfile()
@@ -105,19 +105,19 @@ def test_what_a_button_brought_in_is_undone_and_done_again(full, scene, addon, b
     assert counts() == after
 
 
-def test_two_shots_of_a_file_have_their_own_splats(full, scene, addon, contract, tmp_path):
+def test_two_shots_of_a_file_have_separate_splats(full, scene, addon, contract, tmp_path):
     assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
-    other = tmp_path / "other.splannequin"
-    shutil.copytree(full, other)
-    scene.splannequin.shot_path = str(other)
+    second_shot = tmp_path / "other.splannequin"
+    shutil.copytree(full, second_shot)
+    scene.splannequin.shot_path = str(second_shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
-    fill(scene, other, addon, contract)
+    fill(scene, second_shot, addon, contract)
     assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
     find = addon("freeze.splats").find
-    first, second = find(scene, full, "freeze"), find(scene, other, "freeze")
+    first, second = find(scene, full, "freeze"), find(scene, second_shot, "freeze")
     assert first is not None and second is not None and first != second
-    addon("process.begin").remove_all(scene, other)
-    assert find(scene, full, "freeze") == first and find(scene, other, "freeze") is None
+    addon("process.begin").remove_all(scene, second_shot)
+    assert find(scene, full, "freeze") == first and find(scene, second_shot, "freeze") is None
 
 
 def add_matte(shot, contract, name):
@@ -156,13 +156,13 @@ def test_the_node_of_a_matte_is_undone_and_done_again(full, scene, addon, contra
     assert matte_nodes(addon) == {("him", folder, 5)} and set(bpy.data.images.keys()) == after
 
 
-def test_two_shots_of_a_file_have_their_own_mattes(full, scene, addon, contract, tmp_path):
+def test_two_shots_of_a_file_have_separate_mattes(full, scene, addon, contract, tmp_path):
     """The mattes and the takes have equal names. A second insertion reuses the existing node."""
-    other = tmp_path / "other.splannequin"
-    shutil.copytree(full, other)
-    folders = {shot: add_matte(shot, contract, "him") for shot in (full, other)}
+    second_shot = tmp_path / "other.splannequin"
+    shutil.copytree(full, second_shot)
+    folders = {shot: add_matte(shot, contract, "him") for shot in (full, second_shot)}
     assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
-    for shot in (full, other, full, other):
+    for shot in (full, second_shot, full, second_shot):
         scene.splannequin.shot_path = str(shot)
         assert bpy.ops.splannequin.insert_matte(name="him") == {"FINISHED"}
     assert matte_nodes(addon) == {("him", folder, 5) for folder in folders.values()}

@@ -41,15 +41,15 @@ def test_a_camera_level_with_the_points_is_turned_by_its_up(maths):
 
 
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("first", "second"),
     [((0, 0, 1), (0, 0, 1)), ((0, 0, -2), (0, 0, 1)), ((1, 2, 3), (-1, -2, -3)), ((1, 2, 3), (3, -1, 0))],
 )
-def test_the_shortest_turn(maths, one, other):
-    rotation = maths.turn(np.array(one, float), np.array(other, float))
-    np.testing.assert_allclose(rotation @ maths.unit(one), maths.unit(other), atol=1e-12)
+def test_the_shortest_turn(maths, first, second):
+    rotation = maths.turn(np.array(first, float), np.array(second, float))
+    np.testing.assert_allclose(rotation @ maths.unit(first), maths.unit(second), atol=1e-12)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
-    cosine = maths.unit(one) @ maths.unit(other)
+    cosine = maths.unit(first) @ maths.unit(second)
     assert np.trace(rotation) == pytest.approx(1 + 2 * cosine), "no turn beyond what is needed"
 
 

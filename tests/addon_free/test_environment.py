@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="the stand-ins are shell
 GOOD = "NVIDIA GeForce RTX 3090, 580.65.06, 8.6"
 OLD_DRIVER = "NVIDIA GeForce RTX 3090, 535.183.01, 8.6"
 OLD_CARD = "Tesla P100-PCIE-16GB, 580.65.06, 6.0"
-OWN, BOTH = "pypi.org", "pypi.org, download.pytorch.org"
+PYPI_ONLY, BOTH = "pypi.org", "pypi.org, download.pytorch.org"
 
 
 @pytest.mark.parametrize("variable", [None, "", "https://download.pytorch.org/whl/cu126"])
@@ -32,7 +32,7 @@ def test_launcher_and_add_on_know_one_rule(addon, nvidia_smi, tmp_path, monkeypa
     said = environment.sources(system)
     # Blender cannot wait for NVIDIA's tool; if the tool exists, Blender assumes a suitable GPU.
     doubt = system == "win32" and variable is None and card in (OLD_CARD, OLD_DRIVER)
-    assert said == (BOTH if taken or doubt else OWN)
+    assert said == (BOTH if taken or doubt else PYPI_ONLY)
     if doubt:
         assert not brings_cuda(taken, system), "4 GB that such a card cannot use"
 
@@ -44,10 +44,10 @@ def test_the_launcher_is_left_to_choose(addon, tmp_path, monkeypatch, variable):
     monkeypatch.delenv(TORCH_INDEX, raising=False)
     if variable is not None:
         monkeypatch.setenv(TORCH_INDEX, variable)
-    python, told = tmp_path / "python", tmp_path / "told"
-    python.write_text(f"#!/bin/sh\nenv > '{told}'\n")
+    python, environment_file = tmp_path / "python", tmp_path / "told"
+    python.write_text(f"#!/bin/sh\nenv > '{environment_file}'\n")
     python.chmod(0o755)
     setup = environment.start(tmp_path / "backend", str(python), Path(__file__).resolve().parents[2])
     assert setup.process.wait() == 0
-    heard = [line for line in told.read_text().splitlines() if line.startswith(TORCH_INDEX)]
+    heard = [line for line in environment_file.read_text().splitlines() if line.startswith(TORCH_INDEX)]
     assert heard == ([] if variable is None else [f"{TORCH_INDEX}={variable}"])

@@ -93,7 +93,7 @@ def test_what_a_reader_adds_is_not_remembered(addon, long_shot):
     assert "mine" not in shots.read(long_shot).takes["freeze"] and "mine" not in shots.read(long_shot).info
 
 
-def test_only_so_much_is_remembered(addon, tmp_path, monkeypatch):
+def test_cache_size_is_bounded(addon, tmp_path, monkeypatch):
     kept = addon("shot.file_cache")
     monkeypatch.setattr(kept, "_MOST", 3)
     for n in range(6):

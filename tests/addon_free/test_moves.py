@@ -65,11 +65,11 @@ def test_smooth_at_1_leaves_a_tenth_of_the_second_difference_and_follows_the_wal
     assert before[0] > 10 * after[0] and before[1] > 10 * after[1]
     calm = moves.smoothed(shaky, 0.5, 0.5)
     assert np.abs(calm[:, :3, 3] - walk[:, :3, 3]).max() < 0.05
-    apart = calm[:, :3, :3] @ walk[:, :3, :3].swapaxes(1, 2)
-    assert np.degrees(np.arccos(np.clip((np.trace(apart, axis1=1, axis2=2) - 1) / 2, -1, 1))).max() < 3.0
+    difference = calm[:, :3, :3] @ walk[:, :3, :3].swapaxes(1, 2)
+    assert np.degrees(np.arccos(np.clip((np.trace(difference, axis1=1, axis2=2) - 1) / 2, -1, 1))).max() < 3.0
 
 
-def test_positions_and_rotations_are_smoothed_apart(moves):
+def test_positions_and_rotations_are_smoothed_independently(moves):
     poses = path(60, 0.02)
     moved, turned_ = moves.smoothed(poses, 1.0, 0.0), moves.smoothed(poses, 0.0, 1.0)
     np.testing.assert_allclose(moved[:, :3, :3], poses[:, :3, :3], atol=1e-12)
@@ -93,7 +93,7 @@ def test_a_quaternion_is_that_of_its_rotation_and_goes_the_short_way(moves):
     assert ((found[1:] * found[:-1]).sum(1) > 0).all()
 
 
-def test_a_stop_is_reached_held_and_left_without_a_kink(moves):
+def test_stops_have_smooth_starts_and_ends(moves):
     timing = moves.retimed(10, 90, 50, 20, 30, 12)
     assert timing.frames[0] == 10 and timing.frames[-1] == 90 and len(timing.frames) == 81 + 10 + 30 + 6
     pace = np.diff(timing.frames)
@@ -125,8 +125,8 @@ def test_poses_between_frames(moves):
 
 def test_an_orbit_keeps_its_distance_and_comes_back(moves):
     poses, pivot, up = np.tile(path(5)[2], (61, 1, 1)), np.array([1.0, 0.5, -4.0]), np.array([0.0, 0.0, 1.0])
-    held = np.linspace(0, 1, 61)
-    round_it = moves.orbit(poses, held, pivot, up, (np.radians(40), 0.0))
+    times = np.linspace(0, 1, 61)
+    round_it = moves.orbit(poses, times, pivot, up, (np.radians(40), 0.0))
     np.testing.assert_allclose(round_it[[0, -1]], poses[[0, -1]], atol=1e-12)
     np.testing.assert_allclose(
         np.linalg.norm(round_it[:, :3, 3] - pivot, axis=1), np.linalg.norm(poses[:, :3, 3] - pivot, axis=1), atol=1e-12
@@ -135,7 +135,7 @@ def test_an_orbit_keeps_its_distance_and_comes_back(moves):
     np.testing.assert_allclose(round_it[30, :3, :3], expected @ poses[0, :3, :3], atol=1e-12)
     np.testing.assert_allclose(round_it[30, :3, 3], pivot + expected @ (poses[0, :3, 3] - pivot), atol=1e-12)
     # The pivot stays at its place in the picture, also when the camera rises.
-    risen = moves.orbit(poses, held, pivot, up, (np.radians(40), np.radians(-20)))
+    risen = moves.orbit(poses, times, pivot, up, (np.radians(40), np.radians(-20)))
     seen = np.einsum("nij,nj->ni", risen[:, :3, :3].swapaxes(1, 2), pivot - risen[:, :3, 3])
     np.testing.assert_allclose(seen, seen[:1].repeat(61, 0), atol=1e-12)
 
@@ -147,8 +147,8 @@ def test_the_point_in_the_middle_of_the_picture(moves):
     assert lens[2] + lens[0] * seen[0] / 5.0 == pytest.approx(160)
     assert lens[3] - lens[1] * seen[1] / 5.0 == pytest.approx(120)
     rng = np.random.default_rng(1)
-    ahead = np.concatenate([rng.uniform(-0.4, 0.4, (101, 2)), -np.linspace(2, 6, 101)[:, None]], axis=1)
+    points = np.concatenate([rng.uniform(-0.4, 0.4, (101, 2)), -np.linspace(2, 6, 101)[:, None]], axis=1)
     aside = np.array([[50.0, 0.0, -1.0], [0.0, 0.0, 3.0]]).repeat(200, 0)
-    world = np.concatenate([ahead, aside]) @ pose[:3, :3].T + pose[:3, 3]
+    world = np.concatenate([points, aside]) @ pose[:3, :3].T + pose[:3, 3]
     assert moves.depth_of_points(pose, lens, size, world) == pytest.approx(4.0)
     assert moves.depth_of_points(pose, lens, size, world[101:]) == 0.0

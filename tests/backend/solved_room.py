@@ -174,7 +174,7 @@ def again(solved, tmp_path):
 def tools():
     """Helpers for the tests of this folder."""
 
-    def asked(folder, pictures, **changes):
+    def request_for(folder, pictures, **changes):
         """A worker's request and frames.json for `pictures`, written into a folder without other frames."""
         (folder / "pictures").mkdir()
         names = [f"{n:06d}.png" for n in range(1, len(pictures) + 1)]
@@ -188,11 +188,11 @@ def tools():
     def fisheye_rays(focal, k1, size=(WIDTH, HEIGHT)):
         """[H, W, 3] ray directions of a fisheye of `size`."""
         x, y = np.meshgrid(np.arange(size[0]) + 0.5 - size[0] / 2, np.arange(size[1]) + 0.5 - size[1] / 2)
-        away = np.hypot(x, y)
-        angle = away / focal
+        radius = np.hypot(x, y)
+        angle = radius / focal
         for _ in range(30):
-            angle -= (angle * (1.0 + k1 * angle**2) - away / focal) / (1.0 + 3.0 * k1 * angle**2)
-        return np.stack([x * np.sin(angle) / away, y * np.sin(angle) / away, np.cos(angle)], axis=-1)
+            angle -= (angle * (1.0 + k1 * angle**2) - radius / focal) / (1.0 + 3.0 * k1 * angle**2)
+        return np.stack([x * np.sin(angle) / radius, y * np.sin(angle) / radius, np.cos(angle)], axis=-1)
 
     class Tools:
         recorder = Recorder
@@ -202,5 +202,5 @@ def tools():
         look = staticmethod(look)
         write_clip = staticmethod(write_clip)
 
-    Tools.asked, Tools.fisheye_rays = staticmethod(asked), staticmethod(fisheye_rays)
+    Tools.request_for, Tools.fisheye_rays = staticmethod(request_for), staticmethod(fisheye_rays)
     return Tools

@@ -95,7 +95,7 @@ def test_wrong_input_is_one_sentence(tmp_path, capsys, arguments, code, word):
     assert "Traceback" not in text
 
 
-def test_hosts_are_known_by_their_files_alone(capsys):
+def test_hosts_are_discovered_from_their_files(capsys):
     from torch_backend.deformation import hosts
 
     assert HOSTS == host_names() == tuple(hosts())
@@ -106,10 +106,10 @@ def test_hosts_are_known_by_their_files_alone(capsys):
 
 
 @pytest.mark.parametrize(
-    "made", ['HOST = HostSpec("fourth", Config)', 'HOST: HostSpec = HostSpec(\n    config=Config, name="fourth")']
+    "line", ['HOST = HostSpec("fourth", Config)', 'HOST: HostSpec = HostSpec(\n    config=Config, name="fourth")']
 )
-def test_a_host_is_known_however_its_file_names_it(tmp_path, made):
-    (tmp_path / "fourth.py").write_text(f"from .protocol import HostSpec\n\n{made}\n", encoding="utf-8")
+def test_a_host_is_known_however_its_file_names_it(tmp_path, line):
+    (tmp_path / "fourth.py").write_text(f"from .protocol import HostSpec\n\n{line}\n", encoding="utf-8")
     (tmp_path / "protocol.py").write_text("HOSTS = ('none',)\nHOST_WORDS = dict(name='none')\n", encoding="utf-8")
     assert host_names(tmp_path) == ("fourth",)
 
@@ -125,7 +125,7 @@ def test_export_writes_and_refuses_in_words(world, tmp_path):
     assert refused.stderr.startswith("Error: ") and "already contains another COLMAP model" in refused.stderr
 
 
-def test_solve_refuses_cameras_that_are_not_there(world, tmp_path):
+def test_solve_refuses_missing_cameras(world, tmp_path):
     shot = tmp_path / "s.splannequin"
     shutil.copytree(world.shot.root, shot)
     listing = shot / "frames" / "frames.json"

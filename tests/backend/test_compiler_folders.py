@@ -32,7 +32,7 @@ def environ(tmp_path: Path) -> dict[str, str]:
     return {"PROGRAMDATA": str(tmp_path / "all users"), "USERPROFILE": "C:\\Users\\Jörg"}
 
 
-def test_plain_names_and_other_systems_stay_as_they_are(warp_of, tmp_path: Path):
+def test_ascii_paths_and_other_systems_are_unchanged(warp_of, tmp_path: Path):
     plain, odd = warp_of("plain"), warp_of("Jörg")
     assert compiler_folders(plain, "1.0", environ(tmp_path), tmp_path, windows=True).headers is None
     assert compiler_folders(plain, "1.0", environ(tmp_path), tmp_path, windows=True).kernels is None
@@ -54,7 +54,7 @@ def test_an_umlaut_moves_headers_and_kernels_once(warp_of, tmp_path: Path):
     assert only_cache.headers is None and only_cache.kernels == found.kernels
 
 
-def test_a_copy_that_was_interrupted_is_made_anew(warp_of, tmp_path: Path):
+def test_interrupted_copy_is_repeated(warp_of, tmp_path: Path):
     odd = warp_of("Jörg")
     first = compiler_folders(odd, "1.0", environ(tmp_path), odd, windows=True).headers
     os.rename(first / "native", first / "native.part")
@@ -92,7 +92,7 @@ def test_a_folder_that_another_user_may_have_filled_is_not_taken(warp_of, tmp_pa
         compiler_folders(odd, "1.0", places, odd, windows=True)
 
 
-def test_nowhere_to_go_is_one_sentence(warp_of, tmp_path: Path):
+def test_missing_ascii_folder_gives_a_readable_error(warp_of, tmp_path: Path):
     odd = warp_of("Jörg")
     for places in ({}, {"PROGRAMDATA": str(tmp_path / "Jörg")}, {"PUBLIC": "not absolute"}):
         with pytest.raises(JobError, match="the compiler cannot open .*Jörg") as refused:

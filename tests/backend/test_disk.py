@@ -54,9 +54,9 @@ def test_a_checkpoint_that_does_not_fit_ends_the_job_in_words(world, disk):
     shot = Shot(shutil.copytree(world.shot.root, folder / "s.splannequin", ignore=ignored))
 
     def train(listener, **changes):
-        asked = job.new_job(shot, "train", TrainParams(iterations=60, max_gaussians=1500, **changes))
-        code, _ = job.run_job(asked, listener)
-        return code, contract.from_dict(contract.Status, contract.read_json(asked / contract.STATUS_FILE))
+        folder_of_job = job.new_job(shot, "train", TrainParams(iterations=60, max_gaussians=1500, **changes))
+        code, _ = job.run_job(folder_of_job, listener)
+        return code, contract.from_dict(contract.Status, contract.read_json(folder_of_job / contract.STATUS_FILE))
 
     events = []
     assert train(events.append)[0] == ExitCode.OK
@@ -86,7 +86,7 @@ def test_a_checkpoint_that_does_not_fit_ends_the_job_in_words(world, disk):
     assert json.loads((shot.run("main") / "summary.json").read_text())["iterations"] == 60
 
 
-def test_pictures_and_videos_are_whole_or_not_there(disk):
+def test_pictures_and_videos_are_complete_or_absent(disk):
     folder = disk(1)
     frames = np.random.default_rng(0).integers(0, 255, (6, 480, 848, 3), dtype=np.uint8)
     for write in (lambda: write_png(folder / "a.png", frames[0]), lambda: write_video(folder / "a.mp4", frames, 24.0)):

@@ -31,22 +31,22 @@ def submitted(trained, tmp_path_factory):
 
 def test_a_template_of_one_layout_runs_on_another(submitted, tmp_path):
     pytest.importorskip("openjd.cli")
-    there = tmp_path / "farm"
-    shutil.copytree(submitted / "shots", there / "shots")
+    farm_folder = tmp_path / "farm"
+    shutil.copytree(submitted / "shots", farm_folder / "shots")
     rules = [
         {
             "source_path_format": "POSIX",
             "source_path": str(submitted / "shots"),
-            "destination_path": str(there / "shots"),
+            "destination_path": str(farm_folder / "shots"),
         },
         {"source_path_format": "POSIX", "source_path": "/software", "destination_path": str(ROOT)},
     ]
-    (there / "rules.json").write_text(json.dumps({"version": "pathmapping-1.0", "path_mapping_rules": rules}))
+    (farm_folder / "rules.json").write_text(json.dumps({"version": "pathmapping-1.0", "path_mapping_rules": rules}))
     values = json.loads((submitted / "job" / "parameters.json").read_text())
     values |= {"Splannequin": "/software", "HostPython": sys.executable, "BackendPython": sys.executable}
     template = str(submitted / "job" / "template.json")
     command = [sys.executable, "-P", "-m", "openjd", "run", template, "-p", json.dumps(values)]
-    command += ["--path-mapping-rules", f"file://{there / 'rules.json'}", "--no-run-dependencies"]
+    command += ["--path-mapping-rules", f"file://{farm_folder / 'rules.json'}", "--no-run-dependencies"]
     before = sorted(p.relative_to(submitted) for p in submitted.rglob("*"))
     said = ""
     for step, first in (("open", None), ("freeze", 101), ("freeze", 109), ("finish", None)):
@@ -55,13 +55,13 @@ def test_a_template_of_one_layout_runs_on_another(submitted, tmp_path):
         done = subprocess.run([*command, "--step", f"tiny: {step}", *words], capture_output=True, text=True)
         said += done.stdout
         assert done.returncode == 0, done.stdout + done.stderr
-    take = ShotFolder(there / "shots" / "tiny.splannequin").take("freeze_0110")
+    take = ShotFolder(farm_folder / "shots" / "tiny.splannequin").take("freeze_0110")
     assert [int(p.stem) for p in sorted(take.glob("*.exr"))] == list(range(101, 117))
     assert read_frozen_exr(take / "000109.exr").metadata.t_star_frame == 110
     assert json.loads((take / "take.json").read_text())["exr_dir"] == str(take)
     assert sorted(p.relative_to(submitted) for p in submitted.rglob("*")) == before, "nothing where it was submitted"
     assert "openjd_progress: 100.0" in said and "tiny, freeze freeze_0110: freezing" in said
-    took = json.loads((there / "shots" / "tiny.splannequin" / "farm" / "freeze-110-109.json").read_text())
+    took = json.loads((farm_folder / "shots" / "tiny.splannequin" / "farm" / "freeze-110-109.json").read_text())
     amount = (8 + (8 + FIRST_FRAMES) * PER_WORKING) * 64 * 48 / 1e6
     assert took["amount"] == pytest.approx(amount, abs=1e-3) and took["cpu_seconds"] > 0
 
@@ -142,7 +142,7 @@ def test_a_file_that_cannot_grow_is_said_without_a_traceback(submitted, tmp_path
     assert "openjd_fail: tiny, open a: " in done.stdout and "Traceback" not in done.stderr
 
 
-def test_a_host_without_blender_says_so(task, monkeypatch, submitted, tmp_path, capsys):
+def test_missing_blender_gives_a_readable_error(task, monkeypatch, submitted, tmp_path, capsys):
     from torch_backend.farm_task import BLENDER_VARIABLE
 
     monkeypatch.delenv(BLENDER_VARIABLE, raising=False)
@@ -157,8 +157,8 @@ def test_a_host_without_blender_says_so(task, monkeypatch, submitted, tmp_path, 
 def test_two_shots_of_one_name_are_baked_into_two_folders(imported_shots, tmp_path, monkeypatch, capsys):
     from torch_backend.farm_task import BLENDER_VARIABLE
 
-    told = "import json, sys; print('Told:', json.dumps(sys.argv[2:]))"
-    monkeypatch.setenv(BLENDER_VARIABLE, json.dumps([sys.executable, "-c", told]))
+    program = "import json, sys; print('Told:', json.dumps(sys.argv[2:]))"
+    monkeypatch.setenv(BLENDER_VARIABLE, json.dumps([sys.executable, "-c", program]))
     roots = [str(root) for root in imported_shots]
     assert cli.main(["farm", "export", *roots, "--bake", "--output", str(tmp_path / "job"), "--t-star", "4"]) == 0
     capsys.readouterr()

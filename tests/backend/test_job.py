@@ -51,22 +51,22 @@ def test_done_is_last_and_status_is_true(shot, monkeypatch):
 
 
 def test_what_a_station_foretells_is_what_is_left(shot, monkeypatch):
-    told = []
+    seconds_left = []
 
     def station(shot, params, report):
         for stage, done in (("one", 0), ("one", 1), ("other", 1)):
             report.progress(stage, done, 1000, "")
-            told.append(report.status.eta_seconds)
+            seconds_left.append(report.status.eta_seconds)
             report.metric(contract.FORECAST, {"of": "one", "seconds_left": 5000.0})
         report.progress("one", 2, 1000, "")
         report.metric(contract.FORECAST, {"of": "one", "seconds_left": 0.0})
-        told.append(report.status.eta_seconds)
+        seconds_left.append(report.status.eta_seconds)
         report.progress("one", 3, 1000, "")
-        told.append(report.status.eta_seconds)
+        seconds_left.append(report.status.eta_seconds)
 
     run_with(shot, monkeypatch, station)
-    before, one, other, again, overdue = told
-    assert before is other is overdue is None and 4000 < one <= 5000 and 4000 < again <= 5000
+    before, first, second_stage, again, overdue = seconds_left
+    assert before is second_stage is overdue is None and 4000 < first <= 5000 and 4000 < again <= 5000
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_what_a_user_can_put_right_is_a_value_error_to_whoever_tries(shot):
     assert isinstance(missing.value, JobError) and missing.value.exit_code == ExitCode.USAGE
 
 
-def test_a_name_that_is_no_text_is_told_as_well_as_may_be(shot, monkeypatch):
+def test_undecodable_name_is_printed_escaped(shot, monkeypatch):
     """File names on Linux are bytes: a clip from an old camera may have one in Latin-1."""
 
     def station(shot, params, report):
@@ -151,7 +151,7 @@ def test_a_package_that_the_environment_lacks_is_no_bug(shot, monkeypatch):
     assert "Press Repair" in status.hint and "a_package" in (folder / contract.LOG_FILE).read_text()
 
 
-def test_a_package_that_is_there_and_cannot_be_loaded_is_no_bug_either(shot, monkeypatch, tmp_path):
+def test_unloadable_package_is_not_reported_as_a_bug(shot, monkeypatch, tmp_path):
     """A system library is missing, or another package has the wrong version."""
     (tmp_path / "a_broken_package.py").write_text("raise ImportError('libx.so.1: cannot open shared object file')")
     monkeypatch.syspath_prepend(tmp_path)
@@ -208,10 +208,10 @@ def test_status_prints_no_escape_codes_and_goes_on_after_a_damaged_job(shot, cap
     from torch_backend.cli import main
 
     texts = {"a-import-\x1b[31m": {"state": "done", "message": "\x1b]0;title\x07 here\nand there"}, "b-import-1": {}}
-    for name, told in texts.items():
+    for name, expected in texts.items():
         folder = shot.jobs / name
         folder.mkdir(parents=True)
-        status = {"kind": "import", "pid": 1, "started": 1.0, "process_started": 1.0, "heartbeat": 1.0, **told}
+        status = {"kind": "import", "pid": 1, "started": 1.0, "process_started": 1.0, "heartbeat": 1.0, **expected}
         (folder / contract.STATUS_FILE).write_text(json.dumps(status))
     assert main(["status", str(shot.root)]) == ExitCode.OK
     printed = capsys.readouterr().out

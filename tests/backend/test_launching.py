@@ -50,13 +50,13 @@ def test_threads_and_numbers_are_those_of_each_call():
     launch_on(KERNEL, 2, [out.data_ptr(), 1.0], CPU)
     launch_on(KERNEL, 6, [out.data_ptr(), 2.0], CPU)
     launch_on(KERNEL, 0, [out.data_ptr(), 64.0], CPU)
-    other = torch.zeros(3)
-    launch_on(KERNEL, 3, [other.data_ptr(), 8.0], CPU)
+    second = torch.zeros(3)
+    launch_on(KERNEL, 3, [second.data_ptr(), 8.0], CPU)
     launch_on(KERNEL, 1, [out.data_ptr(), 16.0], CPU)
-    assert out.tolist() == [19.0, 3.0, 2.0, 2.0, 2.0, 2.0] and other.tolist() == [8.0, 8.0, 8.0]
+    assert out.tolist() == [19.0, 3.0, 2.0, 2.0, 2.0, 2.0] and second.tolist() == [8.0, 8.0, 8.0]
 
 
-def test_threads_of_python_launch_beside_each_other():
+def test_python_threads_launch_concurrently():
     outs = [torch.zeros(500) for _ in range(4)]
 
     def work(n):
@@ -72,7 +72,7 @@ def test_threads_of_python_launch_beside_each_other():
         assert (out[: 100 * (n + 1)] == 200.0 * (n + 1)).all() and not out[100 * (n + 1) :].any()
 
 
-def test_a_bare_structure_stands_for_a_warp_structure():
+def test_plain_structure_replaces_a_warp_structure():
     wp_struct = wp.struct(type("Both", (), {"__annotations__": {"out": wp.uint64, "value": wp.float32}}))
 
     def fill(args, tid): ...
@@ -166,16 +166,16 @@ def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
         time.sleep(0.1)
         signal.pthread_kill(main, signal.SIGINT)
 
-    other = threading.Thread(target=interrupt)
+    thread = threading.Thread(target=interrupt)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     try:
-        other.start()
+        thread.start()
         with pytest.raises(KeyboardInterrupt):
             run_workers(run, Block(), 0, 3)
     finally:
         signal.signal(signal.SIGINT, before)
     assert begun and sorted(begun) == sorted(ended)
-    other.join()
+    thread.join()
 
 
 def test_a_caller_does_itself_what_no_worker_has_begun():
@@ -210,8 +210,8 @@ def interrupted_at(step, work):
         return look
 
     before = sys.gettrace()
-    own = native.__file__
-    sys.settrace(lambda frame, event, arg: look(frame, event, arg) if frame.f_code.co_filename == own else None)
+    module_file = native.__file__
+    sys.settrace(lambda frame, event, arg: look(frame, event, arg) if frame.f_code.co_filename == module_file else None)
     try:
         work()
     except KeyboardInterrupt:
@@ -274,7 +274,7 @@ def test_workers_may_have_workers():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows does not fork")
-def test_a_forked_child_has_workers_of_its_own():
+def test_forked_child_has_new_workers():
     counted(3, 1)
     child = os.fork()
     if child == 0:

@@ -76,7 +76,7 @@ def ask(child, header):
     return read_message(child.stdout)
 
 
-def test_ready_tells_what_there_is_to_freeze(session, trained):
+def test_ready_message_lists_what_can_be_frozen(session, trained):
     _, summary = trained
     header = session[1]
     assert header["kind"] == "ready"
@@ -138,50 +138,50 @@ def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, traine
     world, _ = trained
     freeze_shot(world.shot, FreezeParams(take="plates", t_star=112, first=105, last=105), quiet())
     want = read_frozen_exr(world.shot.take("plates") / "000105.exr")
-    asked = view_of(world, 105, 112.2, exposed_like=105.0)
-    asked["viewmat"] = [v + 1e-6 for v in asked["viewmat"]]  # rounding as from Blender
-    splats, made = (picture(ask(session[0], {**asked, "detail": detail})) for detail in (False, True))
+    request = view_of(world, 105, 112.2, exposed_like=105.0)
+    request["viewmat"] = [v + 1e-6 for v in request["viewmat"]]  # rounding as from Blender
+    splats, plates = (picture(ask(session[0], {**request, "detail": detail})) for detail in (False, True))
     shown = linear_to_srgb(want.rgba[..., :3]).clip(0, 1)
-    difference = np.abs(made[0][..., :3] - shown).max(-1)
+    difference = np.abs(plates[0][..., :3] - shown).max(-1)
     assert np.quantile(difference, 0.9) < 4e-3
     assert difference.max() < 0.05  # filled areas differ, because fewer plates are used
-    assert np.abs(made[0][..., 3] - want.rgba[..., 3]).max() < 1 / 255
+    assert np.abs(plates[0][..., 3] - want.rgba[..., 3]).max() < 1 / 255
     seen = want.rgba[..., 3] > 0.99
-    np.testing.assert_array_equal(made[1], splats[1])
-    assert np.median(np.abs(made[1][seen] / want.depth[seen] - 1)) < 0.02
+    np.testing.assert_array_equal(plates[1], splats[1])
+    assert np.median(np.abs(plates[1][seen] / want.depth[seen] - 1)) < 0.02
     assert np.abs(splats[0][..., :3] - shown).mean() > 3.0 * difference.mean()
     for show in ("guesses", "support", "motion"):
-        plain, same = (picture(ask(session[0], {**asked, "show": show, "detail": d}))[0] for d in (False, True))
+        plain, same = (picture(ask(session[0], {**request, "show": show, "detail": d}))[0] for d in (False, True))
         np.testing.assert_array_equal(plain, same)
 
 
 @pytest.mark.parametrize("size", [(64, 48), (150, 60), (20, 30)])
-def test_a_view_of_any_size_is_made_of_plates(trained, size):
+def test_view_of_any_size_uses_plates(trained, size):
     world, _ = trained
     session = LiveSession(world.shot, "main", "cpu")
     width, height = size
     k = [width * 60 / 64, width * 60 / 64, 0.4 * width, 0.6 * height]
-    asked = {**view_of(world, 105, 105, *size, exposed_like=105.0), "K": k}
-    del asked["kind"]
-    splats, made = (picture(session.draw(LiveView(**asked, detail=detail)))[0] for detail in (False, True))
-    assert made.shape == (height, width, 4)
+    request = {**view_of(world, 105, 105, *size, exposed_like=105.0), "K": k}
+    del request["kind"]
+    splats, plates = (picture(session.draw(LiveView(**request, detail=detail)))[0] for detail in (False, True))
+    assert plates.shape == (height, width, 4)
     covered = splats[..., 3] > 0.99
     # The same view: the splats are at the right place, but soft.
-    assert np.abs(made - splats)[covered].mean() < 0.03
-    assert np.abs(made - splats)[covered].max() > 1e-3
+    assert np.abs(plates - splats)[covered].mean() < 0.03
+    assert np.abs(plates - splats)[covered].max() > 1e-3
 
 
-def test_a_view_of_plates_gives_way_to_a_newer_one_and_is_made_after_it(session, trained):
+def test_plate_view_yields_to_a_newer_request_and_finishes_later(session, trained):
     world, _ = trained
     child, _ = session
-    asked = [
+    requests = [
         {"view": 1, "seq": 1, "detail": True},
         {"view": 2, "seq": 2},
         {"view": 3, "seq": 3, "detail": True},
         {"view": 3, "seq": 4, "detail": True},
         {"view": 2, "seq": 5},
     ]
-    for change in asked:
+    for change in requests:
         write_message(child.stdin, {**view_of(world, 105, 108, exposed_like=105.0), **change})
     came = []
     while not {1, 4, 5} <= set(came):
@@ -195,11 +195,11 @@ def test_a_view_of_plates_gives_way_to_a_newer_one_and_is_made_after_it(session,
     assert came.index(5) < max(came.index(1), came.index(4))
 
 
-def test_what_is_being_made_of_plates_stops_between_two_plates(trained):
+def test_plate_view_is_interruptible_between_plates(trained):
     world, _ = trained
     session = LiveSession(world.shot, "main", "cpu")
-    asked = {k: v for k, v in view_of(world, 105, 112, exposed_like=105.0).items() if k != "kind"}
-    view = LiveView(**asked, detail=True)
+    request = {k: v for k, v in view_of(world, 105, 112, exposed_like=105.0).items() if k != "kind"}
+    view = LiveView(**request, detail=True)
     turns = iter([False, False, True])
     with pytest.raises(Superseded):
         session.draw(view, lambda: next(turns))
@@ -217,7 +217,7 @@ def test_what_is_being_made_of_plates_stops_between_two_plates(trained):
     assert waiting.next() is newer
 
 
-def test_without_its_footage_a_view_of_plates_says_so_and_splats_go_on(trained, tmp_path):
+def test_missing_footage_is_reported_and_splat_views_continue(trained, tmp_path):
     world, _ = trained
     shutil.copytree(world.shot.root, tmp_path / "torn.splannequin")
     child = start(tmp_path / "torn.splannequin")
@@ -239,8 +239,8 @@ def test_guesses_are_tinted_by_how_ill_they_were_seen(trained):
     world, _ = trained
     session = LiveSession(world.shot, "main", "cpu")
     session._at(112, True).support[:] = 0.25
-    asked = {k: v for k, v in view_of(world, 105, 112).items() if k != "kind"}
-    plain, tinted = (picture(session.draw(LiveView(**asked, show=show)))[0] for show in ("color", "guesses"))
+    request = {k: v for k, v in view_of(world, 105, 112).items() if k != "kind"}
+    plain, tinted = (picture(session.draw(LiveView(**request, show=show)))[0] for show in ("color", "guesses"))
     guess = 0.75 * _TINTED
     expected = plain[..., :3] * (1.0 - guess) + guess * plain[..., 3:] * np.array(_TINT)
     seen = plain[..., 3] > 0.99
@@ -266,12 +266,12 @@ def test_two_instants_differ_where_the_patch_moved(session, trained):
 )
 def test_a_request_that_makes_no_sense_is_answered_in_words_and_the_session_goes_on(session, trained, change, words):
     world, _ = trained
-    asked = {**view_of(world, 105, 105), **change}
+    request = {**view_of(world, 105, 105), **change}
     if words is None:
         with pytest.raises(ValueError, match="JSON"):
-            write_message(session[0].stdin, asked)
+            write_message(session[0].stdin, request)
     else:
-        header, _ = ask(session[0], asked)
+        header, _ = ask(session[0], request)
         assert (header["kind"], header["seq"]) == ("error", 7)
         assert words in header["message"]
     picture(ask(session[0], view_of(world, 105, 105)))

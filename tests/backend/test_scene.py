@@ -64,7 +64,7 @@ def test_images_are_area_averages(world):
     torch.testing.assert_close(half, full.reshape(24, 2, 32, 2, 3).mean((1, 3)), atol=2e-3, rtol=0)
 
 
-def test_a_camera_that_stands_still_is_refused(world, tmp_path):
+def test_static_camera_is_refused(world, tmp_path):
     import shutil
 
     from torch_backend.shot import Shot
@@ -80,7 +80,7 @@ def test_a_camera_that_stands_still_is_refused(world, tmp_path):
         load_scene(shot)
 
 
-def test_unsolved_shot_says_so(tmp_path):
+def test_unsolved_shot_gives_a_readable_error(tmp_path):
     from torch_backend.shot import Shot
 
     with pytest.raises(JobError, match="no cameras yet"):

@@ -39,8 +39,8 @@ def test_newer_shot_is_refused(tmp_path):
 def test_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
     path = tmp_path / "a.json"
     write_json(path, {"a": 1})
-    with pytest.raises(OSError, match="full"), atomic_path(path) as beside:
-        beside.write_bytes(b"half")
+    with pytest.raises(OSError, match="full"), atomic_path(path) as partial:
+        partial.write_bytes(b"half")
         raise OSError(errno.ENOSPC, "full")
     assert json.loads(path.read_text()) == {"a": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
@@ -50,16 +50,16 @@ def test_a_file_that_is_being_written_has_hardly_a_longer_path(tmp_path):
     """Windows limits paths to 260 characters, and artists' projects have long paths."""
     names = set()
     for _ in range(100):
-        with atomic_path(tmp_path / "checkpoint.safetensors") as beside:
-            beside.touch()
-            names.add(beside.name)
+        with atomic_path(tmp_path / "checkpoint.safetensors") as partial:
+            partial.touch()
+            names.add(partial.name)
     assert len(names) == 100 and max(map(len, names)) <= len("checkpoint.safetensors") + 20
 
 
-def test_what_went_wrong_in_a_write_is_told_though_its_rest_cannot_be_removed(tmp_path):
+def test_write_error_is_reported_even_if_cleanup_fails(tmp_path):
     """On Windows, the writer of a picture may still have its file open."""
-    with pytest.raises(Cancelled), atomic_path(tmp_path / "a.mp4") as beside:
-        beside.mkdir()
+    with pytest.raises(Cancelled), atomic_path(tmp_path / "a.mp4") as partial:
+        partial.mkdir()
         raise Cancelled
 
 
@@ -114,7 +114,7 @@ def test_content_key_follows_files(tmp_path):
     assert content_key(path, {"a": 1}) != before
 
 
-def test_a_folder_behind_a_link_is_not_the_shots_own(tmp_path):
+def test_linked_folder_is_not_part_of_the_shot(tmp_path):
     shot = Shot.create(tmp_path / "a.splannequin")
     assert shot.own(shot.take("wide") / "preview") == shot.take("wide") / "preview"
     (tmp_path / "theirs").mkdir()

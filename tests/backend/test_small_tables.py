@@ -5,7 +5,7 @@ import torch
 from torch_backend.small_tables import small_table
 
 
-def test_the_same_numbers_are_the_same_tensor_and_others_are_not():
+def test_equal_tables_share_a_tensor():
     cpu = torch.device("cpu")
     one = small_table(((1.0, 2.0), (3.0, 4.5)), torch.float32, cpu)
     assert one.tolist() == [[1.0, 2.0], [3.0, 4.5]] and one.dtype == torch.float32

@@ -173,12 +173,12 @@ def test_a_request_of_blender_gets_the_same_sentences(place, kind, params, word)
         code = done.returncode
     else:
         code, _ = job.run_job(folder)
-    told = json.loads((folder / contract.STATUS_FILE).read_text())["message"]
+    message = json.loads((folder / contract.STATUS_FILE).read_text())["message"]
     assert code == ExitCode.USAGE
-    assert re.search(word, told), told
+    assert re.search(word, message), message
 
 
-def test_the_limits_are_of_fields_that_there_are_and_hold_their_defaults():
+def test_limits_name_existing_fields_and_contain_defaults():
     for cls, limits in contract.LIMITS.items():
         assert set(limits) <= {f.name for f in dataclasses.fields(cls)}
         contract.check_params(cls())

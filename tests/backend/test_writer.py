@@ -19,7 +19,7 @@ from torch_backend.shot import Shot, atomic_path, make_folder, working_on, write
 from torch_backend.writer import _remove_lock, only_writer, patient_writer
 
 CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
-ELSEWHERE = "elsewhere (0a1b2c3d)"
+OTHER_COMPUTER = "elsewhere (0a1b2c3d)"
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def put_lock(shot, writer: Writer) -> None:
     lock_of(shot).write_text(json.dumps(dataclasses.asdict(writer)))
 
 
-def test_a_job_begun_as_soon_as_the_one_before_told_its_end_waits_for_its_lock(shot):
+def test_job_started_right_after_another_waits_for_the_lock(shot):
     """The status is written before the lock is released, so a reader may start the next step in between."""
     folder = job.new_job(shot, "import", contract.ImportParams())
     now, pid = time.time(), os.getpid()
@@ -86,13 +86,13 @@ def test_the_second_job_is_refused_in_words_and_the_first_goes_on(shot):
         writer = wait_for_lock(shot, first)
         os.kill(first.pid, signal.SIGSTOP)  # keeps it working during the checks
         assert (writer.pid, writer.kind, writer.job) == (first.pid, "import", one.name)
-        second, other = begin_import(shot)
+        second, second_job = begin_import(shot)
         assert second.wait() == ExitCode.USAGE and second.communicate()
-        told = status_of(other)
-        assert told.state == "failed" and told.host == contract.computer_name()
+        status = status_of(second_job)
+        assert status.state == "failed" and status.host == contract.computer_name()
         where, since = contract.computer_name().partition(" (")[0], time.strftime("%H:", time.localtime(writer.since))
-        assert told.message.startswith(f"The import of a.splannequin has been running on {where} since {since}")
-        assert told.hint == "Wait for it or cancel it."
+        assert status.message.startswith(f"The import of a.splannequin has been running on {where} since {since}")
+        assert status.hint == "Wait for it or cancel it."
         assert contract.read_writer(shot.root) == writer
     finally:
         os.kill(first.pid, signal.SIGCONT)
@@ -140,26 +140,28 @@ def test_runs_of_one_benchmark_may_be_trained_at_once(shot, monkeypatch):
 
 
 def test_another_computers_lock_is_never_taken_over(shot):
-    put_lock(shot, dataclasses.replace(dead_writer(), host=ELSEWHERE, since=1.0))
-    with pytest.raises(JobError, match="^The training of a.splannequin has been running on elsewhere since 19") as told:
+    put_lock(shot, dataclasses.replace(dead_writer(), host=OTHER_COMPUTER, since=1.0))
+    with pytest.raises(
+        JobError, match="^The training of a.splannequin has been running on elsewhere since 19"
+    ) as error:
         with only_writer(shot.root, "import", "mine"):
             raise AssertionError("it was")
-    assert str(lock_of(shot)) in told.value.hint and told.value.exit_code == ExitCode.USAGE
+    assert str(lock_of(shot)) in error.value.hint and error.value.exit_code == ExitCode.USAGE
     put_lock(shot, dead_writer())
     with only_writer(shot.root, "import", "mine") as writer:
         assert contract.read_writer(shot.root) == writer
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[" * 5000, '{"host": 1}'])
-def test_a_lock_that_cannot_be_read_is_left_alone_and_named(shot, text, monkeypatch):
+def test_unreadable_lock_is_kept_and_named(shot, text, monkeypatch):
     monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
     lock_of(shot).write_text(text)
     with (
-        pytest.raises(JobError, match="Cannot find out whether a step runs") as told,
+        pytest.raises(JobError, match="Cannot find out whether a step runs") as error,
         only_writer(shot.root, "import", "mine"),
     ):
         raise AssertionError("it was taken")
-    assert str(lock_of(shot)) in told.value.hint and lock_of(shot).read_text() == text
+    assert str(lock_of(shot)) in error.value.hint and lock_of(shot).read_text() == text
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
@@ -174,22 +176,22 @@ def test_a_lock_that_is_a_link_is_not_written_through(shot, tmp_path, monkeypatc
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
-def test_a_lock_that_is_a_link_to_nowhere_is_named(shot, tmp_path, monkeypatch):
+def test_dangling_lock_link_is_named(shot, tmp_path, monkeypatch):
     monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
     lock_of(shot).symlink_to(tmp_path / "nowhere")
-    with pytest.raises(JobError, match="cannot be created") as told, only_writer(shot.root, "import", "mine"):
+    with pytest.raises(JobError, match="cannot be created") as error, only_writer(shot.root, "import", "mine"):
         raise AssertionError("it was taken")
-    assert str(lock_of(shot)) in told.value.message and not (tmp_path / "nowhere").exists()
+    assert str(lock_of(shot)) in error.value.message and not (tmp_path / "nowhere").exists()
 
 
-def test_a_job_whose_shot_was_taken_over_ends_and_leaves_it_to_the_other(shot, monkeypatch):
+def test_job_ends_when_its_shot_was_taken_over(shot, monkeypatch):
     """The job was suspended, or lost its disk, for longer than the heartbeat timeout."""
     monkeypatch.setattr(contract, "HEARTBEAT_SECONDS", 0.02)
-    other = dataclasses.replace(dead_writer(), host=ELSEWHERE)
+    new_owner = dataclasses.replace(dead_writer(), host=OTHER_COMPUTER)
 
     def station(shot, params, report):
         report.check_cancelled()
-        put_lock(shot, other)
+        put_lock(shot, new_owner)
         for _ in range(500):
             time.sleep(0.01)
             report.check_cancelled()
@@ -197,8 +199,8 @@ def test_a_job_whose_shot_was_taken_over_ends_and_leaves_it_to_the_other(shot, m
     monkeypatch.setitem(job.RUNNERS, "import", station)
     folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
     assert job.run_job(folder)[0] == ExitCode.USAGE
-    assert status_of(folder).message.startswith(f"{ELSEWHERE} took over the shot")
-    assert contract.read_writer(shot.root) == other
+    assert status_of(folder).message.startswith(f"{OTHER_COMPUTER} took over the shot")
+    assert contract.read_writer(shot.root) == new_owner
 
 
 CROWD = """
@@ -240,27 +242,27 @@ def test_of_all_who_take_a_dead_ones_place_one_gets_it(shot, tmp_path):
     ]
     os.close(gate)
     os.close(opens)
-    told = [child.communicate() for child in crowd]
-    assert [errors for _, errors in told] == [""] * 4 and [held for held, _ in told] == ["60\n"] * 4
+    outputs = [child.communicate() for child in crowd]
+    assert [errors for _, errors in outputs] == [""] * 4 and [printed for printed, _ in outputs] == ["60\n"] * 4
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps a folder that a process works in where it is")
 def test_a_shot_that_is_moved_ends_its_training_in_a_sentence(world, tmp_path):
-    root, away = tmp_path / "a.splannequin", tmp_path / "b.splannequin"
+    root, moved = tmp_path / "a.splannequin", tmp_path / "b.splannequin"
     shutil.copytree(world.shot.root, root)
     folder = job.new_job(Shot(root), "train", contract.TrainParams(iterations=100_000, max_gaussians=500, device="cpu"))
     command = [sys.executable, "-P", "-m", "torch_backend", "run-job", str(folder)]
     child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     while child.poll() is None and '"stage": "training"' not in read(folder / contract.EVENTS_FILE):
         time.sleep(0.01)
-    os.rename(root, away)
+    os.rename(root, moved)
     _, errors = child.communicate()
     assert child.returncode == ExitCode.USAGE
     assert f"The training stopped: the shot folder {root} was moved or deleted in the meantime." in errors
     assert not root.exists(), [str(p) for p in root.rglob("*")]
-    events = [json.loads(line) for line in (away / "jobs" / folder.name / "events.jsonl").read_text().splitlines()]
+    events = [json.loads(line) for line in (moved / "jobs" / folder.name / "events.jsonl").read_text().splitlines()]
     assert [e["type"] for e in events[-2:]] == ["error", "done"] and "was moved" in events[-2]["data"]["message"]
-    assert not (away / contract.WRITER_FILE).exists(), "the shot is free where it is now"
+    assert not (moved / contract.WRITER_FILE).exists(), "the shot is free where it is now"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps a folder that a process works in where it is")
@@ -278,7 +280,7 @@ def test_an_import_into_a_shot_that_goes_leaves_nothing_in_its_place(shot, tmp_p
     assert heard[-2].data["message"].startswith("The import ended: the shot folder") and not shot.root.exists()
 
 
-def test_folders_of_a_shot_that_is_worked_on_are_made_only_inside_it(tmp_path):
+def test_locked_shot_creates_folders_only_inside_it(tmp_path):
     root = tmp_path / "a"
     with working_on(root), pytest.raises(FileNotFoundError):
         make_folder(root / "runs" / "main")
@@ -296,43 +298,43 @@ def test_folders_of_a_shot_that_is_worked_on_are_made_only_inside_it(tmp_path):
 def foreign_job(shot) -> tuple[Writer, Path]:
     """A lock of another computer, and the folder of its job."""
     folder = job.new_job(shot, "train", contract.TrainParams())
-    put_lock(shot, Writer(ELSEWHERE, 77, 1.0, "train", folder.name, time.time()))
+    put_lock(shot, Writer(OTHER_COMPUTER, 77, 1.0, "train", folder.name, time.time()))
     return contract.read_writer(shot.root), folder
 
 
 def beat(folder: Path, at: float) -> None:
-    status = contract.Status("train", "running", 77, 1.0, 1.0, at, host=ELSEWHERE)
+    status = contract.Status("train", "running", 77, 1.0, 1.0, at, host=OTHER_COMPUTER)
     write_json(folder / contract.STATUS_FILE, dataclasses.asdict(status))
 
 
-def test_a_patient_writer_takes_the_shot_from_one_that_fell_silent_elsewhere_and_from_no_other(shot):
+def test_patient_writer_takes_over_only_from_a_silent_remote_writer(shot):
     """The timeout only uses this computer's clock, because the other clock may be an hour off."""
     _, folder = foreign_job(shot)
-    told: list[str] = []
+    reasons: list[str] = []
 
     def waiting(why: str) -> None:
-        told.append(why)
-        if len(told) < 8:  # it is alive, with heartbeats by another clock
-            beat(folder, 1e6 + len(told))
+        reasons.append(why)
+        if len(reasons) < 8:  # it is alive, with heartbeats by another clock
+            beat(folder, 1e6 + len(reasons))
 
     with patient_writer(shot.root, "freeze", "mine", waiting, silence=0.4) as mine:
-        assert len(told) >= 8 and "The training of a.splannequin has been running on elsewhere" in told[0]
+        assert len(reasons) >= 8 and "The training of a.splannequin has been running on elsewhere" in reasons[0]
         assert contract.read_writer(shot.root) == mine
     assert not lock_of(shot).exists() and not list(shot.root.glob(".lock*"))
 
 
-def test_a_patient_writer_waits_for_one_of_its_own_computer_however_silent(shot):
+def test_patient_writer_waits_for_a_silent_local_writer(shot):
     pid = os.getpid()
     put_lock(shot, Writer(contract.computer_name(), pid, contract.process_start(pid), "train", "silent", time.time()))
-    asked: list[str] = []
+    reasons: list[str] = []
 
     def waiting(why: str) -> None:
-        asked.append(why)
-        if len(asked) == 6:
+        reasons.append(why)
+        if len(reasons) == 6:
             lock_of(shot).unlink()
 
     with patient_writer(shot.root, "train", "mine", waiting, silence=0.05) as mine:
-        assert len(asked) >= 6 and mine.job == "mine"
+        assert len(reasons) >= 6 and mine.job == "mine"
 
 
 def test_a_lock_that_changed_hands_is_not_taken_for_the_dead_ones(shot):

@@ -44,7 +44,7 @@ def pooled_figures(pooled: dict[str, Pooled]) -> dict[str, dict[str, float | Non
 
 
 @pytest.mark.parametrize(("shift", "score"), [(1, 1.0), (4, 0.5)])
-def test_boundary_off_by_a_pixel_is_found(shift: int, score: float) -> None:
+def test_one_pixel_boundary_error_is_found(shift: int, score: float) -> None:
     truth, box = floor_and_box()
     pooled = Pooled()
     pooled.add_boundary(torch.where(torch.roll(box, shift, 1), 1.5, 80.0 / (torch.arange(40.0) + 2.0)[:, None]), truth,

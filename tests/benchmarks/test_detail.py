@@ -58,7 +58,7 @@ def test_figures_of_one_frame_are_what_they_are_called(scene):
     assert picture_figures(image, scene, torch.zeros_like(bad))["still_db"] is None
 
 
-def test_a_shifted_and_a_soft_picture_are_told(scene):
+def test_shifted_and_soft_pictures_are_distinguished(scene):
     still = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     same = picture_figures(scene, scene, still)
     assert same["gradient"] == 1.0 and same["whole_db"] == same["best_90_db"] == 120.0
@@ -83,13 +83,13 @@ def test_still_is_far_from_movers_and_known():
     matte[:, 50:] = 128 / 255  # unknown
     still = still_pixels(matte)
     assert not still[:, :18].any() and still[:, 18:50].all() and not still[:, 50:].any()
-    elsewhere = torch.zeros(40, 60, dtype=torch.bool)
-    elsewhere[20, 30] = True
-    still = still_pixels(matte, elsewhere)
+    unknown = torch.zeros(40, 60, dtype=torch.bool)
+    unknown[20, 30] = True
+    still = still_pixels(matte, unknown)
     assert not still[12:29, 22:39].any() and still[11, 30] and still[20, 39]
 
 
-def test_points_are_seen_where_the_other_camera_has_them():
+def test_points_project_into_the_second_camera():
     rng = np.random.default_rng(1)
     depth = rng.uniform(2.0, 5.0, (6, 8))
     K = np.array([[50.0, 0, 4.2], [0, 52.0, 2.9], [0, 0, 1]])
@@ -97,16 +97,16 @@ def test_points_are_seen_where_the_other_camera_has_them():
     turn = 0.1
     b[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
     a[:3, 3], b[:3, 3] = [0.1, 0.0, 0.3], [-0.2, 0.05, -0.1]
-    places, there = induced_places(*(torch.from_numpy(v) for v in (depth, a, K, b, 2 * K)))
+    places, is_inside = induced_places(*(torch.from_numpy(v) for v in (depth, a, K, b, 2 * K)))
     for y, x in ((0, 0), (3, 5), (5, 7)):
         point = np.linalg.inv(K) @ [x + 0.5, y + 0.5, 1.0] * depth[y, x]
         point = b @ np.linalg.inv(a) @ [*point, 1.0]
         seen = 2 * K @ point[:3]
         np.testing.assert_allclose(places[y, x], seen[:2] / seen[2], atol=2e-4)
-        assert there[y, x] == pytest.approx(point[2], abs=1e-5)
+        assert is_inside[y, x] == pytest.approx(point[2], abs=1e-5)
     b[2, 3] = -100.0
-    places, there = induced_places(*(torch.from_numpy(v) for v in (depth, a, K, b, K)))
-    assert (there < 0).all() and not inside(places, 8, 6).any()
+    places, is_inside = induced_places(*(torch.from_numpy(v) for v in (depth, a, K, b, K)))
+    assert (is_inside < 0).all() and not inside(places, 8, 6).any()
 
 
 def test_what_another_surface_hides_is_not_seen_again(grid):
@@ -160,7 +160,7 @@ def test_a_flat_wall_is_not_judged_by_flow(scene):
     assert textured(scene).float().mean() > 0.8
 
 
-def test_percentiles_of_many_frames_are_those_of_all_values():
+def test_pooled_percentiles_equal_those_of_all_values():
     rng = np.random.default_rng(2)
     values = [rng.exponential(1.5, n) for n in (500, 3000, 40)]
     histogram = Histogram()
@@ -173,7 +173,7 @@ def test_percentiles_of_many_frames_are_those_of_all_values():
         assert histogram.percentile(percent) == pytest.approx(np.percentile(together, percent), abs=0.06)
 
 
-def test_difference_is_taken_where_asked():
+def test_difference_is_measured_inside_the_mask():
     a, b = torch.zeros(4, 4, 3), torch.zeros(4, 4, 3)
     b[0] = 0.5
     where = torch.zeros(4, 4, dtype=torch.bool)

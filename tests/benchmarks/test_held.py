@@ -19,8 +19,8 @@ from benchmarks.synthetic.cameras import intrinsics
 from benchmarks.synthetic.generate import SHUTTER_FRAMES, SUBFRAMES, write_geometry
 from benchmarks.synthetic.held import CAST, ROLES, change_times
 from benchmarks.synthetic.people import Bodies
-from benchmarks.synthetic.regions import Geometry, View, held_elsewhere, region_maps, views_of
-from benchmarks.synthetic.sizes import HELD, SIZES, THING
+from benchmarks.synthetic.regions import Geometry, View, held_change_mask, region_maps, views_of
+from benchmarks.synthetic.sizes import HELD, OBJECT_PREFIX, SIZES
 from torch_backend.footage.images import read_png
 from torch_backend.shot import write_json
 
@@ -28,7 +28,7 @@ TINY, SEED, FINER = SIZES["tiny"], 0, 4
 
 
 @pytest.fixture(scope="module")
-def held(tmp_path_factory) -> Path:
+def scene_folder(tmp_path_factory) -> Path:
     """Folder with the geometry."""
     folder = tmp_path_factory.mktemp("held")
     write_geometry(folder, SEED, HELD, TINY, "", Bodies(TINY.texture_step))
@@ -40,19 +40,19 @@ def maps(folder: Path, time: int, pose: int, window: int = 1) -> dict[str, np.nd
     size."""
     geometry, views = Geometry.load(folder), views_of(SEED, TINY, HELD)
     width, height = FINER * TINY.width, FINER * TINY.height
-    own, other = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
-    found = region_maps(geometry, geometry.at(time), time, other, own)
-    return found | {THING + HELD: held_elsewhere(geometry, geometry.at, time, pose, other, window)}
+    frame_view, pose_view = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
+    found = region_maps(geometry, geometry.at(time), time, pose_view, frame_view)
+    return found | {OBJECT_PREFIX + HELD: held_change_mask(geometry, geometry.at, time, pose, pose_view, window)}
 
 
-def test_what_is_held_stands_still_before_and_after_its_change(held):
+def test_changing_object_is_static_before_and_after_its_change(scene_folder):
     """Seed 0 of `tiny`: an arm and a hand change between frames 2 and 6, a person leaves between frames 0 and 8."""
-    plan = json.loads((held / "plan.json").read_text())
+    plan = json.loads((scene_folder / "plan.json").read_text())
     assert [each["name"] for each in plan[HELD]] == list(CAST[SEED])
-    geometry = Geometry.load(held)
+    geometry = Geometry.load(scene_folder)
     for each in plan[HELD]:
-        vertices = np.load(held / "geometry" / f"{each['mover']}.npy")
-        its = np.unique(geometry.triangles[geometry.things[each["name"]]]) - len(geometry.static)
+        vertices = np.load(scene_folder / "geometry" / f"{each['mover']}.npy")
+        its = np.unique(geometry.triangles[geometry.objects[each["name"]]]) - len(geometry.static)
         begin, end = int(each["begin"] * TINY.fps), int(np.ceil(each["end"] * TINY.fps))
         assert begin < end < TINY.t_star_indices()[0] + 1
 
@@ -63,29 +63,31 @@ def test_what_is_held_stands_still_before_and_after_its_change(held):
         assert vertices.shape[0] == TINY.frames
 
 
-def test_the_region_held_is_where_a_still_plate_shows_another_state(held):
+def test_held_region_is_where_a_static_plate_differs(scene_folder):
     """t* is 8, after every change; the poses are 0 (before) and 10 (after)."""
-    before, after = (maps(held, 8, pose, window=0) for pose in (0, 10))
-    assert set(CAST[SEED]) | {HELD} == {name.removeprefix(THING) for name in before if name.startswith(THING)}
-    assert not after[THING + HELD].any()
-    region, arm = before[THING + HELD], before[THING + "raised"]
+    before, after = (maps(scene_folder, 8, pose, window=0) for pose in (0, 10))
+    assert set(CAST[SEED]) | {HELD} == {
+        name.removeprefix(OBJECT_PREFIX) for name in before if name.startswith(OBJECT_PREFIX)
+    }
+    assert not after[OBJECT_PREFIX + HELD].any()
+    region, arm = before[OBJECT_PREFIX + HELD], before[OBJECT_PREFIX + "raised"]
     assert region[arm].mean() > 0.6  # the plate shows the panel there, because the arm was down
-    left = maps(held, 0, 0)[THING + "leaving"]  # area of the person who has left by t* 8, in the plate
-    assert left.sum() > 300 and region[left].mean() > 0.8 and not before[THING + "leaving"][left].any()
+    left = maps(scene_folder, 0, 0)[OBJECT_PREFIX + "leaving"]  # area of the person who has left by t* 8, in the plate
+    assert left.sum() > 300 and region[left].mean() > 0.8 and not before[OBJECT_PREFIX + "leaving"][left].any()
     # She starts to walk at once: if neighbouring frames are considered, her pixels count as moving.
-    assert maps(held, 8, 0)[THING + HELD][left].mean() < 0.1
-    assert region.sum() < 2.5 * (arm | left | before[THING + "resting"]).sum()
+    assert maps(scene_folder, 8, 0)[OBJECT_PREFIX + HELD][left].mean() < 0.1
+    assert region.sum() < 2.5 * (arm | left | before[OBJECT_PREFIX + "resting"]).sum()
 
 
-def test_what_a_plate_shows_in_the_middle_of_its_change_is_not_in_the_region_held(held):
+def test_held_region_excludes_objects_during_their_change(scene_folder):
     """At frame 4 the arm and the hand move and a person walks, which flow detects."""
-    region, shown = maps(held, 8, 4)[THING + HELD], maps(held, 4, 4)
+    region, shown = maps(scene_folder, 8, 4)[OBJECT_PREFIX + HELD], maps(scene_folder, 4, 4)
     for name in CAST[SEED]:
-        assert shown[THING + name].sum() > 50 and region[shown[THING + name]].mean() < 0.15
+        assert shown[OBJECT_PREFIX + name].sum() > 50 and region[shown[OBJECT_PREFIX + name]].mean() < 0.15
 
 
-def test_frames_have_motion_blur_and_the_truth_only_that_of_the_camera(held):
-    plan = json.loads((held / "plan.json").read_text())
+def test_frames_have_motion_blur_and_the_truth_only_that_of_the_camera(scene_folder):
+    plan = json.loads((scene_folder / "plan.json").read_text())
     for job in plan["jobs"]:
         times, views = ([moment[name] for moment in job["shutter"]] for name in ("time", "world_to_camera"))
         pose = int(Path(job["out"]).stem) - 1
@@ -95,8 +97,8 @@ def test_frames_have_motion_blur_and_the_truth_only_that_of_the_camera(held):
         elif 0 < pose < TINY.frames - 1:
             assert max(times) - min(times) == pytest.approx(SHUTTER_FRAMES * (1 - 1 / SUBFRAMES))
             assert np.mean(times) == pytest.approx(pose)
-    others = {name: time for job in plan["jobs"] for name, time in job.get("elsewhen", {}).items()}
-    assert set(others) == {"person0", "person1", "person2"} and max(others.values()) < 8.0
+    elsewhen = {name: time for job in plan["jobs"] for name, time in job.get("elsewhen", {}).items()}
+    assert set(elsewhen) == {"person0", "person1", "person2"} and max(elsewhen.values()) < 8.0
 
 
 @pytest.mark.parametrize("size", ["quick", "medium", "delivery"])
@@ -114,10 +116,10 @@ def test_the_cast_has_every_role_and_no_head_turns_where_no_column_hides_it():
     assert all(seed % 4 in (2, 3) for seed in range(10) if "turned" in CAST[seed])
 
 
-def test_behind_the_truth_everything_is_in_its_other_state(held, tmp_path):
+def test_truth_background_shows_the_second_state(scene_folder, tmp_path):
     """In rendered pictures: at t* 8 a person has left; the other picture shows her at her former place."""
     folder = tmp_path / "rendered"
-    shutil.copytree(held, folder)
+    shutil.copytree(scene_folder, folder)
     plan = json.loads((folder / "plan.json").read_text())
     wanted = ("truth/000009/000009.png", "truth/000009/behind/000009.png", "frames/000009.png")
     jobs = [next(job for job in plan["jobs"] if job["out"] == out) for out in wanted]
@@ -125,8 +127,8 @@ def test_behind_the_truth_everything_is_in_its_other_state(held, tmp_path):
     write_json(folder / "meter.json", {"stops": 0.0, "bpy": "", "threads": 0})
     make._render(folder, make.find_bpy(None), lambda text: None)
     truth, behind, frame = (read_png(folder / out).astype(float) for out in wanted)
-    geometry, view = Geometry.load(held), views_of(SEED, TINY, HELD)[8]
-    left = region_maps(geometry, geometry.at(0), 0, view, view)[THING + "leaving"]
+    geometry, view = Geometry.load(scene_folder), views_of(SEED, TINY, HELD)[8]
+    left = region_maps(geometry, geometry.at(0), 0, view, view)[OBJECT_PREFIX + "leaving"]
     left[:, :] &= behind.sum(axis=2) > 0  # inside the box
     assert left.sum() > 20
     assert np.abs(truth - behind).mean(axis=2)[left].mean() > 20

@@ -15,12 +15,14 @@ def disc(radius=20.0, size=64):
     return np.hypot(x - size / 2, y - size / 2) < radius
 
 
-def test_a_lassos_corners_are_no_farther_off_than_it_is_sloppy():
+def test_lasso_corner_error_is_bounded_by_sloppiness():
     mask = disc()
     (drawn,), (straight,) = lassos(mask, 4.0, 3.0, seed=1), lassos(mask, 4.0, 0.0, seed=1)
     corners, exact = np.array(drawn), np.array(straight)
-    off = np.abs(np.hypot(*(corners - 32.0).T) - 20.0)
-    assert len(corners) > 20 and 1.0 < off.max() <= 3.0 + 1.2  # the outline of pixels is up to 1.2 px inside the circle
+    error = np.abs(np.hypot(*(corners - 32.0).T) - 20.0)
+    assert (
+        len(corners) > 20 and 1.0 < error.max() <= 3.0 + 1.2
+    )  # the outline of pixels is up to 1.2 px inside the circle
     assert np.abs(np.hypot(*(exact - 32.0).T) - 20.0).max() <= 1.2
 
 

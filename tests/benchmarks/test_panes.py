@@ -8,7 +8,7 @@ import pytest
 from benchmarks.synthetic.cameras import _look_at, intrinsics
 from benchmarks.synthetic.geometry import Builder
 from benchmarks.synthetic.panes import GLASS, MIRROR, Pane
-from benchmarks.synthetic.regions import THING, Geometry, View, region_maps
+from benchmarks.synthetic.regions import OBJECT_PREFIX, Geometry, View, region_maps
 
 EYE = np.array([0.0, 0.0, 1.5])
 FRAMES = 3
@@ -39,13 +39,13 @@ def world() -> Geometry:
 def with_board(world: Geometry, moved: list[float]) -> Geometry:
     """The same world with the board displaced."""
     moving = world.moving + np.array(moved, np.float32)
-    return Geometry(world.static, moving, world.triangles, world.panes, world.things)
+    return Geometry(world.static, moving, world.triangles, world.panes, world.objects)
 
 
 def view(yaw: float = 0.0, eye: np.ndarray = EYE) -> View:
     """View along y, rotated to the right by `yaw` radians."""
-    ahead = np.array([np.sin(yaw), np.cos(yaw), 0.0])
-    return View(_look_at(eye, eye + ahead, np.zeros(3)), intrinsics(160, 90), 160, 90)
+    forward = np.array([np.sin(yaw), np.cos(yaw), 0.0])
+    return View(_look_at(eye, eye + forward, np.zeros(3)), intrinsics(160, 90), 160, 90)
 
 
 def box(of: View, low: list[float], high: list[float]) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_a_ray_is_turned_back_as_a_mirror_does():
 def test_masks_are_of_panes_in_which_nothing_moves(world):
     of = view()
     maps = region_maps(world, world.at(1), 1, of, of)
-    mirror, glass, wall = (maps[THING + name] for name in ("mirror", "glass", "wall"))
+    mirror, glass, wall = (maps[OBJECT_PREFIX + name] for name in ("mirror", "glass", "wall"))
     whole = box(of, [-1.2, 2.98, 0.9], [-0.2, 2.98, 2.1])
     image = box(of, [-1.3, 2 * 2.98 + 1.5, 1.6], [-0.9, 2 * 2.98 + 1.5, 2.0])  # mirror image of the board at frame 1
     assert image.any() and maps["moving"][image].all() and not mirror[image].any()
@@ -78,49 +78,51 @@ def test_masks_are_of_panes_in_which_nothing_moves(world):
     assert (maps["depth_mm"][mirror] == 2980).all() and (maps["depth_mm"][glass] == 6000).all()
     assert (maps["depth_mm"][wall] == 3000).all()
     rays = of.rays().reshape(90, 160, 3) * 3.0 + EYE
-    beside = (rays[..., 0] > -1.75) & (rays[..., 0] < 1.85) & (rays[..., 2] > 0.35) & (rays[..., 2] < 2.65)
-    inner = beside & (maps["depth_mm"] == 3000)
+    in_mirror = (rays[..., 0] > -1.75) & (rays[..., 0] < 1.85) & (rays[..., 2] > 0.35) & (rays[..., 2] < 2.65)
+    inner = in_mirror & (maps["depth_mm"] == 3000)
     assert wall[inner].all() and not wall[(rays[..., 0] < -1.85) | (rays[..., 0] > 1.95)].any()
     assert maps["seen"].all()
 
 
-def test_a_mirror_was_seen_where_the_other_view_saw_the_same_in_it(world):
+def test_mirror_pixels_are_seen_if_the_reflection_was_seen(world):
     of = view()
-    mirror = region_maps(world, world.at(1), 1, of, of)[THING + "mirror"]
-    away = region_maps(world, world.at(1), 1, of, view(1.2))
-    assert not away["seen"][mirror].any(), "the mirror is not in that frame"
+    mirror = region_maps(world, world.at(1), 1, of, of)[OBJECT_PREFIX + "mirror"]
+    turned = region_maps(world, world.at(1), 1, of, view(1.2))
+    assert not turned["seen"][mirror].any(), "the mirror is not in that frame"
     # Seen from half a metre to the left, the left third of the mirror's content lies beyond its edge: the image of the
     # wall at -3 is three times as far as the mirror.
-    beside = region_maps(world, world.at(1), 1, of, view(0.0, EYE - [0.5, 0, 0]))
-    share = beside["seen"][mirror].mean()
+    shifted = region_maps(world, world.at(1), 1, of, view(0.0, EYE - [0.5, 0, 0]))
+    share = shifted["seen"][mirror].mean()
     assert share == pytest.approx(2 / 3, abs=0.07)
     columns = np.flatnonzero(mirror.any(axis=0))
-    seen = (beside["seen"] & mirror).sum(axis=0)[columns] / mirror.sum(axis=0)[columns]
+    seen = (shifted["seen"] & mirror).sum(axis=0)[columns] / mirror.sum(axis=0)[columns]
     assert seen[:3].mean() < 0.1 and seen[-3:].mean() > 0.9
 
 
 def test_what_hides_a_point_from_the_mirror_hides_it_from_the_eye(world):
     """From 0.7 to the side, the mirror shows a part of the rear wall that the board at 0.8 hides from the other eye."""
     near = with_board(world, [0.0, 2.3, 0.0])
-    of, other = view(), view(0.0, EYE - np.array([0.7, 0, 0]))
-    maps = region_maps(near, near.at(1), 1, other, of)
-    shown = (other.rays() * 8.96 + other.eye).reshape(90, 160, 3)  # images of the wall at -3, with the mirror at 2.98
+    of, eye_view = view(), view(0.0, EYE - np.array([0.7, 0, 0]))
+    maps = region_maps(near, near.at(1), 1, eye_view, of)
+    shown = (eye_view.rays() * 8.96 + eye_view.eye).reshape(
+        90, 160, 3
+    )  # images of the wall at -3, with the mirror at 2.98
     x, y = np.moveaxis(of.project(shown)[0], 2, 0)
     board = box(of, [-1.3, 2 * 2.98 - 0.8, 1.6], [-0.9, 2 * 2.98 - 0.8, 2.0])
     inside = (x > 0) & (x < 160) & (y > 0) & (y < 90)
     covered = np.zeros_like(board)
     covered[inside] = board[y[inside].astype(int), x[inside].astype(int)]
-    covered &= maps[THING + "mirror"]
+    covered &= maps[OBJECT_PREFIX + "mirror"]
     assert covered.any() and not maps["seen"][covered].any()
-    assert maps["seen"][maps[THING + "mirror"] & ~covered].any()
+    assert maps["seen"][maps[OBJECT_PREFIX + "mirror"] & ~covered].any()
 
 
 def test_what_moves_in_glass_moves_however_still_the_garden_is(world):
     of = view(0.0, EYE + np.array([2.07, 0, 0]))
     maps = region_maps(world, world.at(1), 1, of, of)
     image = box(of, [-1.3, 7.5, 1.6], [-0.9, 7.5, 2.0])
-    assert image.any() and maps["moving"][image].all() and not maps[THING + "glass"][image].any()
-    assert maps[THING + "glass"].any() and (maps["depth_mm"][image] == 6000).all()
+    assert image.any() and maps["moving"][image].all() and not maps[OBJECT_PREFIX + "glass"][image].any()
+    assert maps[OBJECT_PREFIX + "glass"].any() and (maps["depth_mm"][image] == 6000).all()
 
 
 def test_a_board_before_a_mirror_hides_it(world):
@@ -129,4 +131,6 @@ def test_a_board_before_a_mirror_hides_it(world):
     near = with_board(world, [0.3, 3.5, -0.3])
     maps = region_maps(near, near.at(1), 1, of, of)
     hidden = box(of, [-1.0, 2.0, 1.3], [-0.6, 2.0, 1.7])
-    assert hidden.any() and not maps[THING + "mirror"][hidden].any() and (maps["depth_mm"][hidden] == 2000).all()
+    assert (
+        hidden.any() and not maps[OBJECT_PREFIX + "mirror"][hidden].any() and (maps["depth_mm"][hidden] == 2000).all()
+    )

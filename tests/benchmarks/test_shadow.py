@@ -28,7 +28,7 @@ def pixel(view, point):
     return int(y), int(x)
 
 
-def test_the_shadow_lies_opposite_of_the_lamp_and_a_screen_takes_it_away(view):
+def test_shadow_is_opposite_the_lamp_and_blocked_by_a_screen(view):
     of = Set.on(np.zeros(3))
     left = shadow(RayScene(floor(), FACES), view, of)
     middle = of.ball - TO_LAMP * of.ball[2] / TO_LAMP[2]
@@ -46,9 +46,9 @@ def test_likeness_is_one_on_the_truth_and_falls_with_the_error(view):
     truth, of = RayScene(floor(), FACES), Set.on(np.zeros(3))
     found = [likeness(RayScene(floor(-z), FACES), truth, view, of) for z in (0.0, 0.02, 0.3)]
     assert found[0] == pytest.approx(1.0) and found[0] > found[1] > found[2]
-    nowhere = RayScene(floor(0.0, 0.1, (9.0, 9.0)), FACES)
-    assert likeness(nowhere, nowhere, view, of) is None
-    assert likeness(nowhere, truth, view, of) < 0.6, "a shadow that is missing is unlike"
+    far_floor = RayScene(floor(0.0, 0.1, (9.0, 9.0)), FACES)
+    assert likeness(far_floor, far_floor, view, of) is None
+    assert likeness(far_floor, truth, view, of) < 0.6, "a shadow that is missing is unlike"
 
 
 def test_balls_rest_on_what_is_seen(view):

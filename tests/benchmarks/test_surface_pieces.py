@@ -21,8 +21,8 @@ def looking(x: float, shows_speck: bool) -> View:
     depth, motion = np.full((HEIGHT, WIDTH), WALL, np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
     for (at_x, at_y, z), moves in ((HAND, 1.0), *([(SPECK, 0.0)] if shows_speck else [])):
         across, down = (u - K[0, 2]) / FOCAL * z + x - at_x, (v - K[1, 2]) / FOCAL * z - at_y
-        is_there = (np.abs(across) < HALF) & (np.abs(down) < HALF)
-        depth[is_there], motion[is_there] = z, moves
+        is_hit = (np.abs(across) < HALF) & (np.abs(down) < HALF)
+        depth[is_hit], motion[is_hit] = z, moves
     color = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     return View(viewmat, K, depth, np.full_like(depth, 0.01), color, motion)
 

@@ -35,7 +35,7 @@ from benchmarks.synthetic.shot import (
     similarity_to_exact,
     surface_points,
 )
-from benchmarks.synthetic.sizes import HARD, HELD, KINDS, REPORT_SEEDS, SIZES, THING, TUNING_SEEDS
+from benchmarks.synthetic.sizes import HARD, HELD, KINDS, OBJECT_PREFIX, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import CameraFrame, CameraPath, Reporter, read_json
 from torch_backend.footage.images import read_png
 from torch_backend.scene import load_scene
@@ -110,7 +110,7 @@ def test_a_scene_is_whole(scene):
     assert min(changed) > 1.0  # the camera moves in every frame
 
 
-def test_camera_stays_inside_the_room_and_people_stand_on_the_floor(scene):
+def test_camera_is_inside_the_room_and_people_on_the_floor(scene):
     static = np.load(scene.root / "geometry" / "static.npz")["vertices"]
     low, high = static.min(axis=0), static.max(axis=0)
     centres = scene.centres()
@@ -124,7 +124,7 @@ def test_camera_stays_inside_the_room_and_people_stand_on_the_floor(scene):
         assert 0.003 < drift.max() < 0.35 and np.median(drift) < 0.08  # still, but not frozen
 
 
-def test_truth_at_the_pose_of_its_own_instant_is_the_clips_frame(scene):
+def test_truth_at_its_clip_pose_equals_the_clip_frame(scene):
     assert (scene.truth(9, 9) == scene.frame(9)).all()
     regions = scene.regions(9, 9)
     assert regions.seen.all()
@@ -133,7 +133,7 @@ def test_truth_at_the_pose_of_its_own_instant_is_the_clips_frame(scene):
 
 @pytest.mark.parametrize("pose", [1, 5])
 def test_seen_pixels_are_where_the_frozen_frame_shows_them(scene, pose):
-    regions, own = scene.regions(9, pose), scene.frame_depth(9)
+    regions, frame_depth = scene.regions(9, pose), scene.frame_depth(9)
     points = unproject(scene, pose, regions.depth)
     pixels, depth = project(scene, 9, points)
     column, row = np.floor(pixels).astype(int).T
@@ -141,11 +141,11 @@ def test_seen_pixels_are_where_the_frozen_frame_shows_them(scene, pose):
     seen = regions.seen.ravel()
     assert not seen[~inside].any()
     # Compared with the frame's own depths: the nearest of 3x3 pixels, because a pixel is not a point.
-    padded = np.pad(own, 1, mode="edge")
+    padded = np.pad(frame_depth, 1, mode="edge")
     around = np.stack([padded[1 + row[inside] + i, 1 + column[inside] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    off = np.abs(around - depth[inside]).min(axis=0) / depth[inside]
+    error = np.abs(around - depth[inside]).min(axis=0) / depth[inside]
     hidden = around.min(axis=0) < depth[inside] - 0.01
-    assert (off[seen[inside]] < 0.02).mean() > 0.99
+    assert (error[seen[inside]] < 0.02).mean() > 0.99
     assert hidden[~seen[inside]].mean() > 0.95
     assert 0.2 < seen.mean() < 1.0
 
@@ -165,7 +165,7 @@ def test_cameras_depths_and_pictures_belong_together(scene, pose):
     assert error(0.0) < 0.75 * min(error(-2.0), error(2.0))
 
 
-def test_what_moves_are_people_and_what_stands_is_still(scene):
+def test_only_people_move(scene):
     moving = scene.frame_moving(9)
     assert 0.005 < moving.mean() < 0.5
     static = np.load(scene.root / "geometry" / "static.npz")["vertices"]
@@ -214,7 +214,7 @@ def test_killed_twice_it_goes_on_to_the_same_pictures(out, scene, tmp_path):
     assert "already there" in run_cli(tmp_path).communicate()[0]
 
 
-def test_what_an_older_generator_made_is_refused(out, scene, tmp_path, capfd):
+def test_scene_of_an_older_generator_is_refused(out, scene, tmp_path, capfd):
     copy = tmp_path / "tiny" / scene.root.name
     copy.mkdir(parents=True)
     write_json(copy / "scene.json", {**scene.info, "key": "another"})
@@ -331,8 +331,8 @@ def seen_from(folder: Path, kind: str, time: int, pose: int) -> dict[str, np.nda
     """`region_maps` of a hard scene of size `tiny`, enlarged."""
     geometry, views = Geometry.load(folder), views_of(SEED, TINY, kind)
     width, height = FINER * TINY.width, FINER * TINY.height
-    own, other = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
-    return region_maps(geometry, geometry.at(time), time, other, own)
+    frame_view, pose_view = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
+    return region_maps(geometry, geometry.at(time), time, pose_view, frame_view)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in HARD if kind in BEFORE])
@@ -341,20 +341,20 @@ def test_a_hard_scene_is_what_it_was(kind, hard):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in HARD if kind != HELD])
-def test_a_hard_scene_has_its_thing_in_view(kind, hard):
+def test_hard_scene_shows_its_object(kind, hard):
     maps = seen_from(hard[kind], kind, 8, 4)
-    things = {name.removeprefix(THING): mask for name, mask in maps.items() if name.startswith(THING)}
-    assert set(things) == ({"glass", "mirror", "wall"} if kind == "glass" else {kind})
-    for mask in things.values():
+    masks = {name.removeprefix(OBJECT_PREFIX): mask for name, mask in maps.items() if name.startswith(OBJECT_PREFIX)}
+    assert set(masks) == ({"glass", "mirror", "wall"} if kind == "glass" else {kind})
+    for mask in masks.values():
         assert 1e-4 < mask.mean() < 0.5
     if kind == "glass":
-        assert not (things["glass"] & things["mirror"]).any() and not (things["wall"] & maps["moving"]).any()
-        assert not ((things["glass"] | things["mirror"]) & maps["moving"]).any()
+        assert not (masks["glass"] & masks["mirror"]).any() and not (masks["wall"] & maps["moving"]).any()
+        assert not ((masks["glass"] | masks["mirror"]) & maps["moving"]).any()
     if kind in ("swinging", "arm"):
-        assert maps["moving"][things[kind]].mean() > 0.7
+        assert maps["moving"][masks[kind]].mean() > 0.7
     if kind == "hair":
         # Most of the hair is seen in front of the window, which shows the sky, or in front of more hair.
-        around = ndimage.binary_dilation(things["hair"], iterations=12)
+        around = ndimage.binary_dilation(masks["hair"], iterations=12)
         assert (maps["depth_mm"][around] == 0).mean() > 0.2
 
 
@@ -374,12 +374,12 @@ def test_an_apple_swings_and_an_arm_gestures(hard):
 
 
 @pytest.mark.parametrize("kind", ["swinging", "arm"])
-def test_what_is_behind_a_thing_is_rendered_around_it(kind, hard):
+def test_background_of_an_object_is_rendered_around_it(kind, hard):
     plan = json.loads((hard[kind] / "plan.json").read_text())
     behind = {Path(job["out"]).name: job for job in plan["jobs"] if "box" in job}
     assert set(behind) == {"000001.png", "000005.png", "000009.png"}
     for pose in (0, 4, 8):
-        mask = seen_from(hard[kind], kind, 8, pose)[THING + kind]
+        mask = seen_from(hard[kind], kind, 8, pose)[OBJECT_PREFIX + kind]
         left, top, right, bottom = FINER * np.array(behind[f"{pose + 1:06d}.png"]["box"])
         inside = np.zeros_like(mask)
         inside[top:bottom, left:right] = True
@@ -387,7 +387,7 @@ def test_what_is_behind_a_thing_is_rendered_around_it(kind, hard):
         assert behind[f"{pose + 1:06d}.png"]["bands"][0]["time"] == 8.0
 
 
-def test_a_mirror_shows_the_room_and_a_thing_can_be_taken_away(hard, tmp_path):
+def test_mirror_shows_the_room_and_object_can_be_removed(hard, tmp_path):
     """In rendered pictures: with the mirror and with a black one; with and without the arm."""
 
     def render(kind: str, name: str, **changes) -> list[np.ndarray]:
@@ -406,13 +406,13 @@ def test_a_mirror_shows_the_room_and_a_thing_can_be_taken_away(hard, tmp_path):
     (dark,) = render("glass", "dark", reflects={"glass": 1.0, "mirror": 0.0})
     geometry, views = Geometry.load(hard["glass"]), views_of(SEED, TINY, "glass")
     maps = region_maps(geometry, geometry.at(0), 0, views[0], views[0])
-    mirror, wall, glass = (ndimage.binary_erosion(maps[THING + name]) for name in ("mirror", "wall", "glass"))
+    mirror, wall, glass = (ndimage.binary_erosion(maps[OBJECT_PREFIX + name]) for name in ("mirror", "wall", "glass"))
     changed = np.abs(shown - dark).mean(axis=2)
     assert np.median(changed[mirror]) > 10 and np.median(changed[glass]) > 2 and np.median(changed[wall]) < 1
     truth, behind = render("arm", "arm")
     geometry, views = Geometry.load(hard["arm"]), views_of(SEED, TINY, "arm")
-    there = region_maps(geometry, geometry.at(8), 8, views[8], views[8])[THING + "arm"]
-    assert (behind[there].sum(axis=1) > 0).all() and (np.abs(truth - behind).mean(axis=2)[there] > 15).mean() > 0.5
+    arm = region_maps(geometry, geometry.at(8), 8, views[8], views[8])[OBJECT_PREFIX + "arm"]
+    assert (behind[arm].sum(axis=1) > 0).all() and (np.abs(truth - behind).mean(axis=2)[arm] > 15).mean() > 0.5
 
 
 def test_an_exact_shot_is_one_that_the_product_trains_on(scene, tmp_path):
@@ -434,8 +434,8 @@ def test_surface_points_lie_on_what_the_frames_see(scene):
     points = surface_points(scene)
     pixels, depth = project(scene, 1, points["xyz"][: len(points["xyz"]) // 6].astype(np.float64))
     column, row = np.clip(np.floor(pixels).astype(int), 0, [scene.width - 1, scene.height - 1]).T
-    off = np.abs(scene.frame_depth(1)[row, column] - depth) / depth
-    assert np.median(off) < 0.01
+    relative_error = np.abs(scene.frame_depth(1)[row, column] - depth) / depth
+    assert np.median(relative_error) < 0.01
 
 
 def test_the_similarity_leads_from_solved_cameras_to_exact_ones(scene, tmp_path):

@@ -172,10 +172,10 @@ def how_far(case: Case, prepared: Prepared, folder: Path, name: str) -> float:
     files = [root / name for root in (folder, prepared.finished[case.kind])]
     if not all(file.suffix == ".exr" and file.is_file() for file in files):
         return float("inf")
-    one, other = (np.nan_to_num(oiio.ImageBuf(str(file)).get_pixels(oiio.FLOAT)) for file in files)
+    first, second = (np.nan_to_num(oiio.ImageBuf(str(file)).get_pixels(oiio.FLOAT)) for file in files)
     return (
-        float((np.abs(one - other) / np.maximum(np.abs(other), 1.0)).max())
-        if one.shape == other.shape
+        float((np.abs(first - second) / np.maximum(np.abs(second), 1.0)).max())
+        if first.shape == second.shape
         else float("inf")
     )
 
@@ -310,13 +310,15 @@ def damaged(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) 
     wrong = [f"process {pid} was left" for pid in child.orphans()] + complaints_about(child, code, folder)
     if code == 0 and case.fault == "truncated file":
         expected = prepared.expected[case.kind]
-        made = expected.keys() - snapshot_of_start(case, prepared).keys()
+        created = expected.keys() - snapshot_of_start(case, prepared).keys()
         wrong += [
-            f"exit code 0, but {n} differs" for n in differences(snapshot(folder), expected) if n != name or n in made
+            f"exit code 0, but {n} differs"
+            for n in differences(snapshot(folder), expected)
+            if n != name or n in created
         ]
     victim.write_bytes(whole)
     wrong += check_again(case, prepared, folder)
-    return [f"{name}: {one}" for one in wrong]
+    return [f"{name}: {first}" for first in wrong]
 
 
 def start_or_refuse(case: Case, prepared: Prepared, folder: Path) -> Child | None:

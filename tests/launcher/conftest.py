@@ -82,8 +82,8 @@ def with_torch(environment: environments.Environment, write_lock, write_wheel) -
 
 
 @pytest.fixture
-def made():
-    """made(folder): creates the virtual environment that a set-up starts with, in a tenth of the time.
+def make_environment():
+    """make_environment(folder): creates the virtual environment that a set-up starts with, in a tenth of the time.
 
     It uses the pip of the current Python. If there is none, the set-up creates the environment again.
     """

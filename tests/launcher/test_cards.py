@@ -19,14 +19,14 @@ ON_CPU = {"torch_device": "cpu", "trains_on": "cpu", "cuda_refusal": "PyTorch se
 CUDA, CPU_BUILD = {**ON_CPU, "torch_cuda": "13.0"}, {**ON_CPU, "torch_cuda": None}
 
 
-def told(facts: dict) -> dict[str, str]:
+def findings(facts: dict) -> dict[str, str]:
     return {finding.what: finding.text for finding in doctor.gpu_findings(facts)}
 
 
 @pytest.mark.parametrize("facts", [CUDA, CPU_BUILD, {}])
 def test_an_old_driver_is_what_is_wrong(nvidia_smi, facts: dict):
     nvidia_smi(OLD_DRIVER)
-    found = told(facts)
+    found = findings(facts)
     assert "driver 535.183.01, and R580 or newer is needed" in found["gpu"] and "Update" in found["gpu"]
     assert "torch on gpu" not in found, "torch is not to blame"
 
@@ -34,48 +34,48 @@ def test_an_old_driver_is_what_is_wrong(nvidia_smi, facts: dict):
 def test_a_driver_that_does_not_know_the_compute_capability_is_old(nvidia_smi):
     nvidia_smi("GeForce GTX 1080 Ti, 470.57.02, 6.1", old=True)
     assert nvidia_cards() == ([Card("GeForce GTX 1080 Ti", "470.57.02", "")], "")
-    assert "driver 470.57.02" in told(CUDA)["gpu"]
+    assert "driver 470.57.02" in findings(CUDA)["gpu"]
 
 
 def test_an_old_card_is_what_is_wrong(nvidia_smi):
     nvidia_smi(OLD_CARD)
-    found = told(CPU_BUILD)
+    found = findings(CPU_BUILD)
     assert "compute capability 6.0, and 7.5" in found["gpu"] and "driver" not in found["gpu"]
     assert "torch on gpu" not in found
 
 
 def test_torch_without_cuda_is_what_is_wrong(nvidia_smi):
     nvidia_smi(OLD_CARD, GOOD)
-    found = told(CPU_BUILD)
+    found = findings(CPU_BUILD)
     assert "without CUDA" in found["torch on gpu"] and "set it up again" in found["torch on gpu"]
 
 
 def test_a_torch_with_cuda_that_sees_no_card_is_not_said_to_be_without(nvidia_smi):
     nvidia_smi(GOOD)
-    assert "does not see NVIDIA GeForce RTX 3090, though" in told(CUDA)["torch on gpu"]
+    assert "does not see NVIDIA GeForce RTX 3090, though" in findings(CUDA)["torch on gpu"]
     used = {"torch_device": "cuda", "trains_on": "cuda", "torch_cuda": "13.0", "cuda_refusal": ""}
-    assert list(told(used)) == ["gpu"]
+    assert list(findings(used)) == ["gpu"]
     warp = {**used, "trains_on": "cpu", "cuda_refusal": "PyTorch sees the NVIDIA GPU, but Warp does not."}
-    assert told(warp)["torch on gpu"] == warp["cuda_refusal"]
+    assert findings(warp)["torch on gpu"] == warp["cuda_refusal"]
 
 
 def test_a_driver_that_does_not_answer(nvidia_smi):
     nvidia_smi("Failed to initialize NVML: Driver/library version mismatch", code=18)
-    assert "version mismatch" in told(CUDA)["gpu"] and "restart" in told(CUDA)["gpu"]
+    assert "version mismatch" in findings(CUDA)["gpu"] and "restart" in findings(CUDA)["gpu"]
 
 
 def test_a_driver_that_speaks_in_another_code_page(nvidia_smi, tmp_path: Path):
     nvidia_smi("x", code=18)
     tool = Path(shutil.which("nvidia-smi") or "")
     tool.write_bytes(b"#!/bin/sh\nprintf 'Der Treiber antwortet nicht: \\374berlastet\\n'; exit 18\n")
-    assert "Der Treiber antwortet nicht" in told(CUDA)["gpu"]
+    assert "Der Treiber antwortet nicht" in findings(CUDA)["gpu"]
 
 
 def test_no_card_is_nothing_to_mend(nvidia_smi, tmp_path: Path, monkeypatch):
     nvidia_smi("No devices were found", code=6)
-    assert "nothing is missing" in told(CUDA)["gpu"]
+    assert "nothing is missing" in findings(CUDA)["gpu"]
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert "nothing is missing" in told(CUDA)["gpu"]
+    assert "nothing is missing" in findings(CUDA)["gpu"]
     assert why_unused(None) is None
 
 

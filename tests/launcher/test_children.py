@@ -82,7 +82,7 @@ def test_ctrl_c_lets_the_child_finish_its_checkpoint(tmp_path: Path, sent: signa
 
 
 @pytest.mark.skipif(os.name == "nt", reason="reads POSIX process groups")
-def test_a_child_that_ignores_ctrl_c_is_ended_with_its_own_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_child_ignoring_ctrl_c_is_killed_with_its_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(children, "GRACE_SECONDS", 0.5)
     grandchild = "import time; time.sleep(60)"
     stubborn = (
@@ -106,7 +106,7 @@ def test_a_child_that_ignores_ctrl_c_is_ended_with_its_own_children(tmp_path: Pa
     raise AssertionError("the grandchild lives on")
 
 
-def test_blenders_own_lines_go_to_the_log_alone(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_blender_output_goes_only_to_the_log(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     lines = [
         "00:01.3  render | Saved: 'x.png'",
         "  baking  4%",
@@ -262,15 +262,15 @@ environments.set_up(environments.Environment("x", pathlib.Path(sys.argv[2]), ("s
 """
 
 
-def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent, made):
+def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent, make_environment):
     """pip waits for an index that does not answer; the index measures when pip hangs up."""
     (requirements / "small.lock").write_text(f"there-is-no-such-package==1.0 --hash=sha256:{'0' * 64}\n")
-    made(tmp_path / "home" / ".venv")
+    make_environment(tmp_path / "home" / ".venv")
     with socket.create_server(("127.0.0.1", 0)) as index:
         index.settimeout(120)
         address = f"http://127.0.0.1:{index.getsockname()[1]}/simple"
-        asked = {"PIP_INDEX_URL": address, "PIP_TIMEOUT": "600", "PIP_NO_INDEX": "0", "NO_PROXY": "*"}
-        launcher = parent(SETTING_UP, requirements, tmp_path / "home" / ".venv", **asked)
+        pip_settings = {"PIP_INDEX_URL": address, "PIP_TIMEOUT": "600", "PIP_NO_INDEX": "0", "NO_PROXY": "*"}
+        launcher = parent(SETTING_UP, requirements, tmp_path / "home" / ".venv", **pip_settings)
         pip, _ = index.accept()
         with pip:
             pip.settimeout(60)

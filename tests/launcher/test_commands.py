@@ -29,7 +29,7 @@ def summary(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
 
 
-def test_doctor_before_set_up_says_so(tmp_path: Path):
+def test_doctor_before_set_up_gives_a_readable_error(tmp_path: Path):
     ran = launch("doctor", "--output", tmp_path, SPLANNEQUIN_HOME=str(tmp_path / "nothing here yet"))
     assert "not created yet: `python3 splannequin.py setup`" in ran.stdout
     found = summary(tmp_path)
@@ -45,7 +45,7 @@ def test_a_name_that_the_console_has_no_letters_for_ends_nothing(tmp_path: Path)
     assert "to create it in" in ran.stdout and "\\u65e5" in ran.stdout and "Traceback" not in ran.stderr
 
 
-def test_a_clip_that_is_not_there_is_one_sentence_and_sets_nothing_up(tmp_path: Path):
+def test_missing_clip_is_refused_before_set_up(tmp_path: Path):
     ran = launch(
         "freeze", tmp_path / "absent.mp4", "--output", tmp_path / "out", SPLANNEQUIN_HOME=str(tmp_path / "home")
     )
@@ -61,13 +61,13 @@ def test_figures_of_an_earlier_run_do_not_pass_for_this_one(tmp_path: Path):
     assert "heldout_psnr_db" not in summary(tmp_path)
 
 
-def test_a_benchmark_of_ones_own_scenes_needs_no_blender():
+def test_benchmark_of_existing_scenes_needs_no_blender():
     assert commands._brings_scenes(["--truth", "folder"]) and commands._brings_scenes(["--shot=x", "--seeds", "2"])
     assert not commands._brings_scenes(["--shot", "x", "--hard"])
     assert not commands._brings_scenes(["--quick"]) and not commands._brings_scenes(["--shot", "x", "--size=tiny"])
 
 
-def test_benchs_help_is_the_benchmarks_own():
+def test_bench_help_is_that_of_the_benchmark():
     if not environments.backend_environment().ready():
         pytest.skip("the backend's environment is not set up by the launcher")
     ran = launch("bench", "--help")
@@ -145,7 +145,7 @@ def test_a_shot_that_is_frozen_anew_tells_of_the_take_that_was_named():
         commands._of_a_shot(str(shot), ["--take", "other"], 2.0)
 
 
-def test_two_shots_and_two_takes_share_no_folder_unless_told_to(tmp_path: Path):
+def test_shots_and_takes_have_separate_folders_by_default(tmp_path: Path):
     where = main._place_of
     for name in ("a", "b"):
         (tmp_path / name / "shot.splannequin").mkdir(parents=True)
@@ -156,28 +156,31 @@ def test_two_shots_and_two_takes_share_no_folder_unless_told_to(tmp_path: Path):
     assert where(str(tmp_path / "walk.splannequin"), ["--take=x"]) == "walk_x"
 
 
-def test_clips_and_shots_of_one_name_have_folders_of_their_own_and_find_them_again(tmp_path: Path):
+def test_same_named_clips_and_shots_have_stable_separate_folders(tmp_path: Path):
     clips = [tmp_path / "in" / name for name in ("a.mov", "a.mp4", "b/a.mp4", "a_.mp4", "a .mp4")]
     shots = [tmp_path / place / "walk.splannequin" for place in "ab"]
     for shot in shots:
         shot.mkdir(parents=True)
 
-    def froze(given: Path) -> str:
-        place = main._place_of(str(given), [], tmp_path / "output")
-        made = tmp_path / "output" / place
-        (made / "shot.splannequin").mkdir(parents=True, exist_ok=True)
-        if given in clips:
-            write_json(made / "shot.splannequin" / "shot.json", {"version": 1, "source": str(given)})
+    def froze(source: Path) -> str:
+        place = main._place_of(str(source), [], tmp_path / "output")
+        output_folder = tmp_path / "output" / place
+        (output_folder / "shot.splannequin").mkdir(parents=True, exist_ok=True)
+        if source in clips:
+            write_json(output_folder / "shot.splannequin" / "shot.json", {"version": 1, "source": str(source)})
         else:
-            (made / "shot.splannequin").rmdir()
-        write_json(made / "summary.json", {"shot": str(made / "shot.splannequin" if given in clips else given)})
+            (output_folder / "shot.splannequin").rmdir()
+        write_json(
+            output_folder / "summary.json",
+            {"shot": str(output_folder / "shot.splannequin" if source in clips else source)},
+        )
         return place
 
     walk = tmp_path / "in" / "walk_freeze.mp4"
     clips.append(walk)
-    first = {given: froze(given) for given in (*shots, *clips)}
+    first = {source: froze(source) for source in (*shots, *clips)}
     assert len(set(first.values())) == len(first) and first[shots[0]] == "walk_freeze" and first[clips[0]] == "a"
-    assert {given: froze(given) for given in (*clips, *shots)} == first
+    assert {source: froze(source) for source in (*clips, *shots)} == first
 
 
 def test_what_only_a_clip_wants_is_refused_of_a_shot(tmp_path: Path):
@@ -198,7 +201,7 @@ def test_a_broken_status_of_a_job_breaks_nothing(tmp_path: Path):
     assert failed_job(tmp_path) == "It broke. Mend it."
 
 
-def test_unknown_options_of_the_launchers_own_commands_are_refused(tmp_path: Path):
+def test_unknown_options_of_launcher_commands_are_refused(tmp_path: Path):
     assert launch("doctor", "--bogus", "--output", tmp_path).returncode == 2
 
 
@@ -236,7 +239,7 @@ def test_an_old_python_says_which_one_is_needed(tmp_path: Path):
         ("[N/A]", "8.9", "note", "cannot interpret"),
     ],
 )
-def test_cards_are_held_against_what_warp_needs(driver: str, compute: str, state: str, says: str):
+def test_gpus_are_checked_against_warp_requirements(driver: str, compute: str, state: str, says: str):
     finding = doctor.gpu_finding(Card("Some card", driver, compute))
     assert finding.state == state
     assert says in finding.text

@@ -39,8 +39,8 @@ def test_set_up_once_then_nothing_is_started(
     assert set_up(environment, "no such python") == 0
 
 
-def test_changed_requirements_are_installed(environment: Environment, write_lock, write_wheel, made):
-    made(environment.folder)
+def test_changed_requirements_are_installed(environment: Environment, write_lock, write_wheel, make_environment):
+    make_environment(environment.folder)
     set_up(environment, sys.executable)
     write_lock("small", write_wheel("smallthing", "2.0", "value = 2"))
     assert not environment.ready()
@@ -49,9 +49,9 @@ def test_changed_requirements_are_installed(environment: Environment, write_lock
 
 
 def test_a_superset_of_the_requirements_is_ready_for_the_subset(
-    environment: Environment, write_lock, write_wheel, made
+    environment: Environment, write_lock, write_wheel, make_environment
 ):
-    made(environment.folder)
+    make_environment(environment.folder)
     write_lock("more", write_wheel("otherthing", "1.0", ""))
     more = dataclasses.replace(environment, requirements=("small", "more"))
     set_up(environment, sys.executable)
@@ -60,8 +60,10 @@ def test_a_superset_of_the_requirements_is_ready_for_the_subset(
     assert more.ready() and environment.ready()
 
 
-def test_nothing_is_installed_that_the_lock_does_not_name(environment: Environment, write_lock, write_wheel, made):
-    made(environment.folder)
+def test_nothing_is_installed_that_the_lock_does_not_name(
+    environment: Environment, write_lock, write_wheel, make_environment
+):
+    make_environment(environment.folder)
     set_up(environment, sys.executable)
     write_wheel("hanger_on", "1.0", "")
     write_lock("more", write_wheel("otherthing", "1.0", "", needs="hanger-on"))
@@ -70,9 +72,11 @@ def test_nothing_is_installed_that_the_lock_does_not_name(environment: Environme
     assert more.ready() and not list(site_packages(environment).glob("hanger_on*"))
 
 
-def test_a_file_with_another_hash_is_not_installed(environment: Environment, write_wheel, tmp_path: Path, made):
+def test_a_file_with_another_hash_is_not_installed(
+    environment: Environment, write_wheel, tmp_path: Path, make_environment
+):
     """The package index, or a folder of wheels, has another file under the same name and version."""
-    made(environment.folder)
+    make_environment(environment.folder)
     write_wheel("smallthing", "1.0", "value = 'of somebody else'")
     for wheels in (None, tmp_path):
         with pytest.raises(LauncherError, match="smallthing .*SHA-256 differs") as refused:
@@ -81,18 +85,18 @@ def test_a_file_with_another_hash_is_not_installed(environment: Environment, wri
     assert not list(environment.folder.rglob("smallthing*"))
 
 
-def test_a_requirement_without_a_hash_is_not_installed(environment: Environment, requirements: Path, made):
-    made(environment.folder)
+def test_a_requirement_without_a_hash_is_not_installed(environment: Environment, requirements: Path, make_environment):
+    make_environment(environment.folder)
     (requirements / "small.lock").write_text("smallthing==1.0\n")
     with pytest.raises(LauncherError, match="installing packages"):
         set_up(environment, sys.executable)
     assert not list(environment.folder.rglob("smallthing*"))
 
 
-def test_from_a_folder_of_wheels_no_index_is_asked(
-    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, write_lock, write_wheel, made
+def test_wheel_folder_uses_no_index(
+    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, write_lock, write_wheel, make_environment
 ):
-    made(environment.folder)
+    make_environment(environment.folder)
     monkeypatch.delenv("PIP_NO_INDEX")
     monkeypatch.delenv("PIP_FIND_LINKS")
     monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")  # nobody listens there
@@ -109,11 +113,11 @@ def test_from_a_folder_of_wheels_no_index_is_asked(
     assert main.main(["setup", "--wheels", str(tmp_path / "absent"), "--output", str(tmp_path / "o")]) == 2
 
 
-def test_torch_alone_is_asked_of_its_index(
-    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made, write_lock, write_wheel
+def test_only_torch_uses_the_torch_index(
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_environment, write_lock, write_wheel
 ):
     """No other package is installed from that index, whatever its version."""
-    made(with_torch.folder)
+    make_environment(with_torch.folder)
     index = tmp_path / "whl" / "cpu"
     theirs = write_wheel("torch", "2.13.0+cpu", "build = 'cpu'")
     write_lock("torch-cpu", theirs)
@@ -135,10 +139,10 @@ def test_torch_alone_is_asked_of_its_index(
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere PyPI's build is the one without CUDA")
 def test_the_build_of_an_index_out_of_reach_is_taken_where_pip_finds_it(
-    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made, write_lock, write_wheel
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_environment, write_lock, write_wheel
 ):
     """pip is configured with a folder that has the build, as here and in CI. A file with another hash is refused."""
-    made(with_torch.folder)
+    make_environment(with_torch.folder)
     monkeypatch.delenv("SPLANNEQUIN_TORCH_INDEX", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))  # no NVIDIA driver
     monkeypatch.setattr(environments, "_reachable", lambda _: False)
@@ -154,9 +158,9 @@ def test_the_build_of_an_index_out_of_reach_is_taken_where_pip_finds_it(
 
 
 def test_cuda_libraries_come_only_with_a_torch_that_asks_for_them(
-    with_torch: Environment, write_lock, write_wheel, made
+    with_torch: Environment, write_lock, write_wheel, make_environment
 ):
-    made(with_torch.folder)
+    make_environment(with_torch.folder)
     set_up(with_torch, sys.executable)
     packages = site_packages(with_torch)
     assert not list(packages.glob("nvidia_small*"))
@@ -183,8 +187,8 @@ def damage(packages: Path, how: str) -> None:
         (info / "RECORD").write_text("".join(line for line in record if not line.startswith("smallthing.py")))
 
 
-def test_a_package_that_was_changed_is_noticed_and_repaired(environment: Environment, capsys, made):
-    made(environment.folder)
+def test_a_package_that_was_changed_is_noticed_and_repaired(environment: Environment, capsys, make_environment):
+    make_environment(environment.folder)
     set_up(environment, sys.executable)
     for how in ("removed", "file removed", "exchanged", "cut off", "record forged"):
         damage(site_packages(environment), how)
@@ -195,16 +199,18 @@ def test_a_package_that_was_changed_is_noticed_and_repaired(environment: Environ
         assert "smallthing" in capsys.readouterr().out
 
 
-def test_what_somebody_installs_besides_is_no_change(environment: Environment, write_wheel, tmp_path: Path, made):
-    made(environment.folder)
+def test_what_somebody_installs_besides_is_no_change(
+    environment: Environment, write_wheel, tmp_path: Path, make_environment
+):
+    make_environment(environment.folder)
     set_up(environment, sys.executable)
-    other = write_wheel("otherthing", "1.0", "")
-    subprocess.run([environment.python, "-m", "pip", "install", "-q", str(other)], check=True)
+    wheel = write_wheel("otherthing", "1.0", "")
+    subprocess.run([environment.python, "-m", "pip", "install", "-q", str(wheel)], check=True)
     assert environment.ready()
 
 
-def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment, made):
-    made(environment.folder)
+def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment, make_environment):
+    make_environment(environment.folder)
     set_up(environment, sys.executable)
     packages = site_packages(environment)
     # State after a kill during pip: the marker, a package with missing files, no RECORD.
@@ -217,14 +223,14 @@ def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Env
     assert value_of(environment) == "1"
 
 
-def test_an_environment_of_ours_without_an_interpreter_is_made_anew(environment: Environment):
+def test_environment_without_an_interpreter_is_recreated(environment: Environment):
     environment.state.mkdir(parents=True)
     (environment.folder / "pyvenv.cfg").touch()
     set_up(environment, sys.executable)
     assert value_of(environment) == "1"
 
 
-def test_an_environment_made_by_hand_is_adopted(environment: Environment):
+def test_manually_created_environment_is_adopted(environment: Environment):
     subprocess.run([sys.executable, "-m", "venv", str(environment.folder)], check=True)
     kept = environment.folder / "kept"
     kept.touch()
@@ -232,7 +238,7 @@ def test_an_environment_made_by_hand_is_adopted(environment: Environment):
     assert environment.ready() and kept.exists()
 
 
-def test_a_folder_of_someone_else_is_left_alone(environment: Environment):
+def test_foreign_folder_is_not_changed(environment: Environment):
     environment.folder.mkdir(parents=True)
     precious = environment.folder / "precious.txt"
     precious.touch()
@@ -242,8 +248,10 @@ def test_a_folder_of_someone_else_is_left_alone(environment: Environment):
     assert refused.value.exit_code == 9
 
 
-def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Environment, requirements: Path, made):
-    made(environment.folder)
+def test_a_package_that_cannot_be_had_names_step_log_and_remedy(
+    environment: Environment, requirements: Path, make_environment
+):
+    make_environment(environment.folder)
     (requirements / "small.lock").write_text(f"there-is-no-such-package==1.0 --hash=sha256:{'0' * 64}\n")
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)
@@ -256,8 +264,10 @@ def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Env
     assert not environment.ready()
 
 
-def test_a_package_that_does_not_import_is_not_ready(environment: Environment, write_lock, write_wheel, made):
-    made(environment.folder)
+def test_a_package_that_does_not_import_is_not_ready(
+    environment: Environment, write_lock, write_wheel, make_environment
+):
+    make_environment(environment.folder)
     write_lock("small", write_wheel("smallthing", "3.0", "import absent_library"))
     with pytest.raises(LauncherError, match="absent_library"):
         set_up(environment, sys.executable)
@@ -273,7 +283,7 @@ def test_a_full_disk_is_said_before_anything_is_written(environment: Environment
 
 @pytest.mark.parametrize(("index", "needed"), [("/whl/cpu", 4), ("/whl/cu130", 9)])
 def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
-    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made, index: str, needed: int
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_environment, index: str, needed: int
 ):
     backend = with_torch
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", f"file://{tmp_path}{index}")
@@ -284,7 +294,7 @@ def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
     assert refused.value.exit_code == 8
     assert not backend.folder.exists()
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 + 1e8)))
-    made(backend.folder)
+    make_environment(backend.folder)
     set_up(backend, sys.executable)
     assert backend.ready()
 
@@ -308,7 +318,7 @@ def test_an_index_out_of_reach_is_not_reckoned_with(
     assert "cannot be reached: torch is installed from the usual index" in capsys.readouterr().out
 
 
-def test_no_other_environment_has_torch():
+def test_only_the_backend_environment_has_torch():
     assert environments.backend_environment(testing=True).torch
     assert not any(e.torch for e in (environments.bpy_environment("5.0"), environments.bench_environment()))
 
@@ -342,7 +352,7 @@ def test_every_package_of_a_lock_has_hashes():
         assert re.fullmatch(f"({entry})+", text), f"{path.name} has a line that pip would take on trust"
 
 
-def test_locks_have_the_versions_that_were_asked_for():
+def test_locks_match_requested_versions():
     """Fails after an edit of a list without a run of tools/lock_requirements.py."""
     folder = environments.REQUIREMENTS
     constraints = pins(folder / "constraints.txt")
@@ -350,9 +360,9 @@ def test_locks_have_the_versions_that_were_asked_for():
         if path.stem != "constraints":
             locks = [path.stem, *(("torch", "cuda") if path.stem == "backend" else ())]
             got = {name: version for lock in locks for name, version in pins(folder / f"{lock}.lock").items()}
-            asked = pins(path)
-            assert asked.items() <= got.items(), f"{path.name}: run tools/lock_requirements.py"
-            agreed = {name: version for name, version in constraints.items() if name in got and name not in asked}
+            requested = pins(path)
+            assert requested.items() <= got.items(), f"{path.name}: run tools/lock_requirements.py"
+            agreed = {name: version for name, version in constraints.items() if name in got and name not in requested}
             assert agreed.items() <= got.items(), f"{path.name}: run tools/lock_requirements.py"
     # These are installed in one environment.
     together = [pins(folder / f"{lock}.lock") for lock in ("backend", "torch", "cuda", "test", "bench")]
@@ -374,7 +384,7 @@ def test_torch_of_this_version_is_known_by_its_hash_but_for_one_wheel():
         assert not lock("https://somewhere.else/simple", python)
 
 
-def test_an_index_that_does_not_answer_is_not_asked_for_every_package(tmp_path: Path):
+def test_unreachable_index_is_not_retried_for_every_package(tmp_path: Path):
     assert environments._reachable(tmp_path.as_uri())
     assert not environments._reachable("https://packages.invalid/whl/cpu")
     assert not environments._reachable("http://127.0.0.1:9/simple")
@@ -393,9 +403,9 @@ def offline(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_index_that_cannot_be_reached_is_what_is_wrong(
-    environment: Environment, requirements: Path, offline, made, monkeypatch: pytest.MonkeyPatch
+    environment: Environment, requirements: Path, offline, make_environment, monkeypatch: pytest.MonkeyPatch
 ):
-    made(environment.folder)
+    make_environment(environment.folder)
     (requirements / "small.lock").write_text(f"smallthing==1.0 --hash=sha256:{'0' * 64}\n")
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)

@@ -12,7 +12,7 @@ def test_the_bundled_clip_carries_its_licence_and_credit():
         assert needed in credit
 
 
-def test_no_other_footage_is_bundled():
+def test_only_listed_footage_is_bundled():
     """Allowed are the script and the small .blend that it makes from the clip, which holds no pictures."""
     folder = Path(places.DEMO_CLIP).parent
     footage = {p.name for p in folder.iterdir() if p.suffix not in (".md", ".py") and p.is_file()}

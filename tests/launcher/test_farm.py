@@ -15,12 +15,12 @@ from launcher import farm
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def told(capsys) -> dict[str, str]:
+def printed_variables(capsys) -> dict[str, str]:
     lines = [line.removeprefix("openjd_env: ") for line in capsys.readouterr().out.splitlines()]
     return dict(line.split("=", 1) for line in lines)
 
 
-def test_a_host_that_is_given_its_python_and_blender_sets_nothing_up(tmp_path, capsys, monkeypatch):
+def test_farm_host_with_python_and_blender_needs_no_set_up(tmp_path, capsys, monkeypatch):
     # the host sets it in this process; monkeypatch restores it for later tests
     monkeypatch.setenv("SPLANNEQUIN_HOME", "")
     blender = tmp_path / "my blender"
@@ -28,7 +28,7 @@ def test_a_host_that_is_given_its_python_and_blender_sets_nothing_up(tmp_path, c
     home = tmp_path / "home"
     words = ["--python", sys.executable, "--home", str(home), "--blender", str(blender), "--bake"]
     assert farm.host(words) == 0
-    said = told(capsys)
+    said = printed_variables(capsys)
     assert said["SPLANNEQUIN_BACKEND_PYTHON"] == sys.executable and said["SPLANNEQUIN_HOME"] == str(home)
     assert json.loads(said["SPLANNEQUIN_BLENDER_COMMAND"])[:2] == [str(blender), "--background"]
     assert not home.exists()
@@ -36,7 +36,7 @@ def test_a_host_that_is_given_its_python_and_blender_sets_nothing_up(tmp_path, c
 
 def test_empty_parameters_of_a_template_are_none(capsys):
     assert farm.host(["--python", sys.executable, "--home", ""]) == 0
-    assert set(told(capsys)) == {"SPLANNEQUIN_BACKEND_PYTHON"}
+    assert set(printed_variables(capsys)) == {"SPLANNEQUIN_BACKEND_PYTHON"}
 
 
 @pytest.mark.parametrize(("flag", "name"), [("--python", "BackendPython"), ("--blender", "Blender")])

@@ -59,7 +59,7 @@ def test_what_pip_prints_in_a_sentence(environment: Environment, printed: str, s
         ("linux-aarch64", "Linux on ARM"), ("linux-riscv64", "linux-riscv64"),
     ],
 )  # fmt: skip
-def test_a_system_without_wheels_is_told_as_that_and_not_as_the_wrong_python(environment: Environment, system, words):
+def test_system_without_wheels_is_not_reported_as_wrong_python(environment: Environment, system, words):
     printed = (
         "ERROR: Could not find a version that satisfies the requirement torch==2.13.0 (from versions: 2.2.0, 2.2.1)\n"
         "ERROR: No matching distribution found for torch==2.13.0"

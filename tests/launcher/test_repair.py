@@ -19,7 +19,7 @@ def site(tmp_path: Path, write_wheel) -> Path:
     return site
 
 
-def test_a_file_of_the_same_size_with_other_contents(site: Path, tmp_path: Path):
+def test_changed_file_of_equal_size_is_detected(site: Path, tmp_path: Path):
     (site / "one.py").write_text("value = 2")
     assert contract.changed_packages(tmp_path / "venv", contract.record_packages(tmp_path / "venv", ["one"])) == []
     assert repair.drop_damaged(tmp_path / "venv", {}) == ["one"]
@@ -54,11 +54,11 @@ def test_what_python_compiles_is_no_damage(site: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("asked", "cuda"),
+    ("requirement", "cuda"),
     [('nvidia-cudnn-cu13==9; platform_system == "Linux"', True), ("cuda-toolkit==13", True), ("filelock", False)],
 )
-def test_a_torch_says_whether_it_needs_cuda(site: Path, tmp_path: Path, write_wheel, asked: str, cuda: bool):
+def test_a_torch_says_whether_it_needs_cuda(site: Path, tmp_path: Path, write_wheel, requirement: str, cuda: bool):
     assert not repair.needs_cuda(tmp_path / "venv")
-    with zipfile.ZipFile(write_wheel("torch", "2.13.0", "", needs=asked)) as wheel:
+    with zipfile.ZipFile(write_wheel("torch", "2.13.0", "", needs=requirement)) as wheel:
         wheel.extractall(site)
     assert repair.needs_cuda(tmp_path / "venv") is cuda

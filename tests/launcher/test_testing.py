@@ -14,7 +14,7 @@ from launcher.testing import Leg, progress, run_legs
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_counts_come_from_pytests_own_report(tmp_path: Path):
+def test_counts_come_from_the_pytest_report(tmp_path: Path):
     (tmp_path / "test_few.py").write_text(
         "import pytest\n"
         "def test_a(): pass\n"
@@ -50,16 +50,18 @@ print("ends", mine.name, other.exists(), flush=True)
 """
 
 
-def test_two_legs_run_beside_each_other_and_each_ones_output_stays_whole(tmp_path: Path, capfd):
+def test_two_legs_run_concurrently_with_separate_output(tmp_path: Path, capfd):
     pair = [tmp_path / "one", tmp_path / "two"]
     legs = [Leg(a.name, [sys.executable, "-c", MEETING, str(a), str(b)]) for a, b in (pair, pair[::-1])]
-    alone = Leg("Three", [sys.executable, "-c", "import os; raise SystemExit(os.environ['OMP_NUM_THREADS'] == '')"])
-    run_legs([*legs, alone], sys.executable, tmp_path, parallel=2)
+    single_leg = Leg(
+        "Three", [sys.executable, "-c", "import os; raise SystemExit(os.environ['OMP_NUM_THREADS'] == '')"]
+    )
+    run_legs([*legs, single_leg], sys.executable, tmp_path, parallel=2)
     out = capfd.readouterr().out
     for name in ("one", "two"):
         assert f"begins {name}\nends {name} True\n\n=== {name}: 1 passed, 0 failed" in out
         assert (tmp_path / f"{name}.log").read_text() == f"begins {name}\nends {name} True\n"
-    assert [leg.passed for leg in (*legs, alone)] == [1, 1, 1]
+    assert [leg.passed for leg in (*legs, single_leg)] == [1, 1, 1]
 
 
 def test_one_leg_at_a_time_prints_as_it_goes(tmp_path: Path, capfd):
@@ -101,7 +103,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
-def test_ctrl_c_reaches_every_leg_and_starts_no_other(tmp_path: Path):
+def test_ctrl_c_stops_every_leg_and_starts_none(tmp_path: Path):
     command = [sys.executable, "-P", "-c", INTERRUPTED, WAITING, str(tmp_path)]
     parent = subprocess.Popen(
         command, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -34,31 +34,31 @@ def file_state() -> dict[str, Any]:
     return found
 
 
-def difference(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+def difference(one: dict[str, Any], second: dict[str, Any]) -> list[str]:
     """List of the differences between two states, one "path: value -> value" each."""
-    return [f"{k}: {one.get(k)} -> {other.get(k)}" for k in sorted({*one, *other}) if one.get(k) != other.get(k)]
+    return [f"{k}: {one.get(k)} -> {second.get(k)}" for k in sorted({*one, *second}) if one.get(k) != second.get(k)]
 
 
-def _read(thing: Any, path: str, found: dict[str, Any], depth: int) -> None:
+def _read(struct: Any, path: str, found: dict[str, Any], depth: int) -> None:
     """Read a struct and its nested structs into `found`; other data-blocks are stored by name only."""
-    found[path] = type(thing).__name__
-    for rna in thing.bl_rna.properties if depth else ():
+    found[path] = type(struct).__name__
+    for rna in struct.bl_rna.properties if depth else ():
         name = rna.identifier
         if name in _UNREAD or name.startswith(("is_", "has_")):
             continue
-        if name == "frame_current" and isinstance(thing, bpy.types.ImageUser):  # frame that was drawn last
+        if name == "frame_current" and isinstance(struct, bpy.types.ImageUser):  # frame that was drawn last
             continue
-        here, value = f"{path}.{name}", getattr(thing, name, None)
+        child_path, value = f"{path}.{name}", getattr(struct, name, None)
         if rna.type == "COLLECTION":
-            found[here] = len(value)
+            found[child_path] = len(value)
             for n, item in enumerate(value if len(value) <= _MOST else ()):
-                _follow(item, f"{here}[{n}]", found, depth)
+                _follow(item, f"{child_path}[{n}]", found, depth)
         elif rna.type == "POINTER":
-            _follow(value, here, found, depth)
+            _follow(value, child_path, found, depth)
         elif getattr(rna, "is_array", False):
-            found[here] = [round(v, 5) if isinstance(v, float) else v for v in _flat(value)]
+            found[child_path] = [round(v, 5) if isinstance(v, float) else v for v in _flat(value)]
         else:
-            found[here] = round(value, 5) if isinstance(value, float) else value
+            found[child_path] = round(value, 5) if isinstance(value, float) else value
 
 
 def _follow(value: Any, path: str, found: dict[str, Any], depth: int) -> None:

@@ -35,7 +35,7 @@ def main() -> None:
     if hasattr(settings, "media_type"):
         settings.media_type = "IMAGE"
     settings.file_format, settings.color_depth, settings.color_mode = "OPEN_EXR", "32", "RGB"
-    told = {"said": bake.insert_freeze(scene, shot, "detail")}
+    result = {"said": bake.insert_freeze(scene, shot, "detail")}
     node = add_on("bake.freeze_group").group_node(add_on("compat").compositor_tree(scene))
     scene.frame_set(6)
     for name, mix in (("plate", 0.0), ("frozen", 1.0), ("warp", 1.0)):
@@ -44,7 +44,7 @@ def main() -> None:
         node.inputs["Mix"].default_value = mix
         scene.render.filepath = str(out / f"{name}.exr")
         bpy.ops.render.render(write_still=True)
-    (out / "told.json").write_text(json.dumps(told))
+    (out / "told.json").write_text(json.dumps(result))
     package.unregister()
 
 

@@ -20,7 +20,7 @@ def add_on(name: str):
     return importlib.import_module(f"bl_ext.user_default.splannequin.splannequin_addon.{name}")
 
 
-def there(scene) -> dict:
+def file_state(scene) -> dict:
     """Everything that a step could change in the file."""
     kinds = ("objects", "cameras", "meshes", "collections", "node_groups", "actions", "images", "textures")
     render, view = scene.render, scene.view_settings
@@ -37,12 +37,12 @@ def there(scene) -> dict:
 
 def tried(scene, change) -> dict:
     """Run a change; return its message or error, and the part of the file that it changed."""
-    before = there(scene)
+    before = file_state(scene)
     try:
         said = {"said": change()}
     except Exception as error:
         said = {"error": f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()}
-    after = there(scene)
+    after = file_state(scene)
     return said | {"changed": {k: (before[k], after[k]) for k in before if before[k] != after[k]}}
 
 
@@ -55,29 +55,29 @@ def main() -> None:
     package.register()
     scene, compat = bpy.context.scene, add_on("compat")
     scene.splannequin.shot_path = str(shot)
-    told = {"blender": bpy.app.version_string}
-    told["first"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
+    result = {"blender": bpy.app.version_string}
+    result["first"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
     # without a plate no colour space is needed, so the camera is built; the next try must not remove it
-    if "error" in told["first"]:
+    if "error" in result["first"]:
         (shot / "frames").rename(shot / "away")
-        told["without a plate"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
+        result["without a plate"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
         (shot / "away").rename(shot / "frames")
-        told["again"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
-    told["freeze"] = tried(scene, lambda: add_on("bake.insertion").insert_freeze(scene, shot, "freeze"))
-    if "error" in told["freeze"]:
+        result["again"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
+    result["freeze"] = tried(scene, lambda: add_on("bake.insertion").insert_freeze(scene, shot, "freeze"))
+    if "error" in result["freeze"]:
         scene.splannequin.keep_colours = False
-        told["as they come"] = tried(scene, lambda: add_on("bake.insertion").insert_freeze(scene, shot, "freeze"))
+        result["as they come"] = tried(scene, lambda: add_on("bake.insertion").insert_freeze(scene, shot, "freeze"))
     else:
-        told["combined"] = tried(scene, lambda: add_on("bake.insertion").combine_cg(scene, shot))
+        result["combined"] = tried(scene, lambda: add_on("bake.insertion").combine_cg(scene, shot))
         node = add_on("bake.freeze_group").group_node(compat.compositor_tree(scene))
         node.inputs["CG"].links[0].from_node.mute = True
         scene.frame_start = scene.frame_end = 6
         for name, mix in (("plate", 0.0), ("frozen", 1.0)):
             node.inputs["Mix"].default_value = mix
             add_on("bake.rendering").render(scene, out / name)
-    told["removed"] = tried(scene, lambda: add_on("process.begin").remove_all(scene, shot))
-    told["end"] = there(scene)
-    (out / "told.json").write_text(json.dumps(told))
+    result["removed"] = tried(scene, lambda: add_on("process.begin").remove_all(scene, shot))
+    result["end"] = file_state(scene)
+    (out / "told.json").write_text(json.dumps(result))
     package.unregister()
 
 

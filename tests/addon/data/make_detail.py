@@ -54,7 +54,7 @@ def moved(pixels: np.ndarray, frame: int) -> np.ndarray:
     return (1 - fy) * upper + fy * ((1 - fx) * pixels[y + 1, x] + fx * pixels[y + 1, x + 1])
 
 
-def other(frame: int) -> np.ndarray:
+def splat_picture(frame: int) -> np.ndarray:
     """[H, W, 3] float32: picture of the splats, in multiples of 1/64."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     return (np.stack([x * 2 + frame, y * 2 + frame, x + y], axis=2) % 65 / 64.0).astype(np.float32)
@@ -70,7 +70,7 @@ def alpha() -> np.ndarray:
 def frozen(frame: int) -> np.ndarray:
     """[H, W, 3] float64: the frozen frame, scene-linear, premultiplied."""
     share = (matte(frame) * alpha())[..., None]
-    return share * moved(plate(frame), frame) + (alpha()[..., None] - share) * other(frame)
+    return share * moved(plate(frame), frame) + (alpha()[..., None] - share) * splat_picture(frame)
 
 
 def source(frame: int) -> np.ndarray:
@@ -92,14 +92,14 @@ def main() -> None:
         color, share = frozen(frame).astype(np.float32), matte(frame) * alpha()
         st = (places(frame) + 0.5) / size
         st[..., 1] = 1.0 - st[..., 1]
-        splat = np.concatenate([other(frame) * alpha()[..., None], alpha()[..., None]], axis=2)
+        splat = np.concatenate([splat_picture(frame) * alpha()[..., None], alpha()[..., None]], axis=2)
         name = f"{frame:06d}.exr"
         write_frozen_exr(
             folder / name, np.concatenate([color, alpha()[..., None]], axis=2), frame * ones, ones, 0.5 * ones,
             FrameMetadata(frame, 6.0, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), light=light),
             detail=DetailLayers(splat, share, source(frame)),
         )  # fmt: skip
-        fill = (alpha() - share)[..., None] * other(frame)
+        fill = (alpha() - share)[..., None] * splat_picture(frame)
         about = WarpMetadata(frame, frame, 6.0, WIDTH, HEIGHT, light=light)
         write_warp(folder / "warp" / name, snap(torch.from_numpy(st), (WIDTH, HEIGHT)), share, fill, alpha(), about)
         if folder == FOLDER:

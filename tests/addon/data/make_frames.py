@@ -38,9 +38,9 @@ def passes(frame: int) -> dict[str, np.ndarray]:
     vector = np.stack([x - 8.0, y - 4.0, frame - x / 2.0, y / 4.0 - 2.0], axis=2)
     normal = np.stack([(x % 5) / 4.0 - 0.5, (y % 5) / 4.0 - 0.5, (x + y) % 3 - 1.0], axis=2)
     position = np.stack([1000.0 + x / 16.0, y - 2000.0, (x * y) / 8.0 - 3.0], axis=2)
-    made = {"Vector": vector, "forward": -vector[..., 2:], "backward": vector[..., :2]}
-    made |= {"Normal": normal, "Position": position}
-    return {name: layer.astype(np.float32) for name, layer in made.items()}
+    layers = {"Vector": vector, "forward": -vector[..., 2:], "backward": vector[..., :2]}
+    layers |= {"Normal": normal, "Position": position}
+    return {name: layer.astype(np.float32) for name, layer in layers.items()}
 
 
 def main() -> None:

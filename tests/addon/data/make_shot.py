@@ -45,8 +45,8 @@ def make_shot(parent: Path) -> Path:
     info = {"version": 1, "name": "my shot é", "first": 5, "last": 7, "fps": 12.5, "width": width, "height": height}
     (folder / "shot.json").write_text(json.dumps(info), encoding="utf-8")
     listed = [{"frame": n, "seconds": n / 12.5, "file": f"raw/{n:06d}.png", "solve": True} for n in frames]
-    told = {"version": 1, "width": width, "height": height, "fps": 12.5, "colour": "srgb", "frames": listed}
-    (folder / "frames" / "frames.json").write_text(json.dumps(told))
+    listing = {"version": 1, "width": width, "height": height, "fps": 12.5, "colour": "srgb", "frames": listed}
+    (folder / "frames" / "frames.json").write_text(json.dumps(listing))
     poses = []
     for n in frames:
         plate = np.full((height, width, 3), 10 * n, np.uint8)

@@ -20,12 +20,12 @@ def main(root: str, path: str, frame: str, depth: str, out: str) -> None:
     from torch_backend.freeze.take.motion_blur import MotionBlur
 
     frames: list[OutputFrame] = []
-    for one in (told := CameraPath.load(path)).frames:
+    for one in (camera_path := CameraPath.load(path)).frames:
         fx, fy, cx, cy = one.K
         K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         frames.append(OutputFrame(one.frame, torch.tensor(one.viewmat).reshape(4, 4), K, 1.0, 1.0))
     middle = next(each for each in frames if each.frame == int(frame))
-    wall = torch.full((told.height, told.width), float(depth))
+    wall = torch.full((camera_path.height, camera_path.width), float(depth))
     cameras = [*MotionBlur(frames, 180.0).beside_middle(middle, middle.K, wall), middle]
     Path(out).write_text(json.dumps([camera.viewmat.flatten().tolist() for camera in cameras]))
 

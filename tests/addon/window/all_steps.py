@@ -28,11 +28,11 @@ def main() -> int:
     return 0 if results.get("frames") == args.last and shares == sorted(shares) and not results["failures"] else 1
 
 
-def play(plan: dict, told: dict) -> Iterator[float]:
+def play(plan: dict, results: dict) -> Iterator[float]:
     """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
-    press._time_ticks(told)
+    press._time_ticks(results)
     yield from press._arrange()
     props, shot = bpy.context.scene.splannequin, Path(plan["work"]) / "sitting.splannequin"
     props.clip, props.shot_path = plan["clip"], str(shot)
@@ -45,18 +45,18 @@ def play(plan: dict, told: dict) -> Iterator[float]:
         yield 0.2
     yield from press._shoot(Path(plan["work"]), "13-all-steps-ready")
     yield from press._click("splannequin.all_steps")
-    told["bar"], taken = [], set()
+    results["bar"], taken = [], set()
     while (now := chain.progress(shot)) is not None:
         step = chain._chains[shot].step
-        told["bar"].append((step, *now))
+        results["bar"].append((step, *now))
         if step not in taken and now[0] > {"solve": 0.1, "train": 0.4, "freeze": 0.8}[step]:
             taken.add(step)
             yield from press._shoot(Path(plan["work"]), f"14-all-steps-{step}", settle=2)
         yield 0.5
     yield from press._shoot(Path(plan["work"]), "15-all-steps-done")
-    told["failures"] = {step: list(failure) for step, failure in watch.failures.items()}
+    results["failures"] = {step: list(failure) for step, failure in watch.failures.items()}
     take = watch.state.takes.get(props.take_name, {})
-    told["frames"], told["t_star"] = take.get("frame_count"), take.get("t_star_frame")
+    results["frames"], results["t_star"] = take.get("frame_count"), take.get("t_star_frame")
 
 
 if __name__ == "__main__":
@@ -64,7 +64,7 @@ if __name__ == "__main__":
         import bpy
 
         plan = json.loads(os.environ[press.PLAN])
-        told = {"blender": bpy.app.version_string, "longest_tick_ms": 0.0}
-        press.act(play(plan, told), Path(plan["work"]), told)
+        results = {"blender": bpy.app.version_string, "longest_tick_ms": 0.0}
+        press.act(play(plan, results), Path(plan["work"]), results)
     else:
         sys.exit(main())

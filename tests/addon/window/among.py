@@ -74,8 +74,8 @@ class Eye:
 
     def size(self, where: Vector, share: float) -> float:
         """Length in the scene, at the distance of `where`, that spans `share` of the frame's width."""
-        away = (where - self.place).dot(self.axis)
-        return share * self.right.length * away / (self.corner - self.place).dot(self.axis)
+        distance = (where - self.place).dot(self.axis)
+        return share * self.right.length * distance / (self.corner - self.place).dot(self.axis)
 
 
 def plane_of(points: np.ndarray, towards: Vector) -> tuple[Vector, Vector]:
@@ -88,8 +88,8 @@ def plane_of(points: np.ndarray, towards: Vector) -> tuple[Vector, Vector]:
     for _ in range(20):
         middle = kept.mean(0)
         normal = np.linalg.svd(kept - middle, full_matrices=False)[2][2]
-        off = np.abs((points - middle) @ normal)
-        kept = points[off <= 2.0 * np.median(off)]
+        distance = np.abs((points - middle) @ normal)
+        kept = points[distance <= 2.0 * np.median(distance)]
     middle, normal = Vector(middle), Vector(normal)
     return middle, normal if normal.dot(towards - middle) > 0 else -normal
 
@@ -163,14 +163,14 @@ def check(picture: np.ndarray, frozen: np.ndarray, cg: np.ndarray) -> dict[str, 
     covered = cg[..., 3] > 0.01
     covered[:, : int(0.36 * covered.shape[1])] = covered[:, int(0.72 * covered.shape[1]) :] = False
     over = cg[..., :3] + (1.0 - cg[..., 3:]) * frozen[..., :3]
-    off = np.abs(display(picture[..., :3]) - display(over)).max(-1)
+    error = np.abs(display(picture[..., :3]) - display(over)).max(-1)
     assert covered.sum() > 2000, f"things should be seen, {covered.sum()} pixels of them are"
     solid, rims = covered & (cg[..., 3] >= 0.99), covered & (cg[..., 3] < 0.99)
     figures: dict[str, float] = {}
     for name, part in {"solid": solid, "rims and shadows": rims}.items():
         figures[f"{name}, px"] = int(part.sum())
-        figures[f"{name}, % within 1/255"] = round(100.0 * float((off[part] <= 1).mean()), 2)
-        figures[f"{name}, 99.9 % within"] = round(float(np.quantile(off[part], 0.999)), 1)
+        figures[f"{name}, % within 1/255"] = round(100.0 * float((error[part] <= 1).mean()), 2)
+        figures[f"{name}, 99.9 % within"] = round(float(np.quantile(error[part], 0.999)), 1)
     for name, place in SHADOWS.items():
         dark = 1.0 - cut(picture, place)[..., :3].mean() / cut(frozen, place)[..., :3].mean()
         figures[f"shadow on the {name}, % darker"] = round(100.0 * float(dark), 1)
@@ -256,7 +256,7 @@ def headless(shot: Path, output: Path, samples: int) -> None:
 # ------------------------------------------------------------------------------------------------- in a window
 
 
-def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     """Play the artist in a window: surface, light, CG and bake by the panel's buttons."""
     work = Path(plan["work"])
     shot = work / "sitting.splannequin"
@@ -277,26 +277,26 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     scene.frame_start = scene.frame_end = cube.FRAME
     scene.frame_set(cube.FRAME)
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
-    yield from _press(shot, "add_surface", told, lambda: _entry().surfaces)
+    yield from _press(shot, "add_surface", results, lambda: _entry().surfaces)
     yield from press._shoot(work, "12-surface")
-    yield from _press(shot, "insert_freeze", told, _group)
-    yield from _press(shot, "combine_cg", told, lambda: _group().inputs["CG"].is_linked)
+    yield from _press(shot, "insert_freeze", results, _group)
+    yield from _press(shot, "combine_cg", results, lambda: _group().inputs["CG"].is_linked)
     yield from press._shoot(work, "12-combined")
     sockets = Sockets(work)
     depth, frozen = sockets.of_group("Depth")[..., 0], sockets.of_group("Image")
     put(Eye(depth))
     yield 1.0
-    yield from _press(shot, "add_light", told, lambda: _entry().light)
+    yield from _press(shot, "add_light", results, lambda: _entry().light)
     yield from press._shoot(work, "12-light")
     scene = _scene()
     scene.cycles.samples = plan["samples"]
     scene.render.filepath = str(work / "baked" / "######")
     settings = scene.render.image_settings
     settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
-    yield from _press(shot, "bake", told)
+    yield from _press(shot, "bake", results)
     picture = cube.pixels_of(next((work / "baked").glob("*.exr")))
     save(picture, Path(plan["output"]))
-    told.update(check(picture, frozen, Sockets(work).cg()))
+    results.update(check(picture, frozen, Sockets(work).cg()))
     yield from _show_render(work)
 
 
@@ -316,7 +316,7 @@ def _group() -> Any:
     return None if tree is None else cube.add_on("bake.freeze_group").group_node(tree)
 
 
-def _press(shot: Path, operator: str, told: dict[str, Any], has: Callable[[], Any] | None = None) -> Iterator[float]:
+def _press(shot: Path, operator: str, results: dict[str, Any], has: Callable[[], Any] | None = None) -> Iterator[float]:
     """Click a button of the panel and wait until its job has ended.
 
     With `has`, which finds the added object, also undo and redo the step.
@@ -335,7 +335,7 @@ def _press(shot: Path, operator: str, told: dict[str, Any], has: Callable[[], An
     yield 1.5
     failed = [sentence for sentence, _ in watch.failures.values()]
     assert not failed, f"{operator}: {failed}"
-    told.setdefault("pressed", {})[operator] = round(time.monotonic() - began)
+    results.setdefault("pressed", {})[operator] = round(time.monotonic() - began)
     if has is None:
         return
     for step, should_be in (("nothing", True), ("undo", False), ("redo", True)):
@@ -344,7 +344,7 @@ def _press(shot: Path, operator: str, told: dict[str, Any], has: Callable[[], An
                 getattr(bpy.ops.ed, step)()
             yield 1.0
         assert bool(has()) == should_be, f"{operator} after {step}"
-    told.setdefault("undone and redone", []).append(operator)
+    results.setdefault("undone and redone", []).append(operator)
 
 
 def _show_render(work: Path) -> Iterator[float]:

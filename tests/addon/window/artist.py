@@ -61,7 +61,7 @@ def main() -> int:
                 blender = subprocess.Popen(command, env={**environ, PLAN: json.dumps(plan)}, start_new_session=True)
                 if turn != 1:
                     press._serve(blender, work, output, environ, args.limit)
-                    results |= _told(work)
+                    results |= _read_results(work)
                     if "error" in results:
                         break
                     continue
@@ -75,13 +75,13 @@ def main() -> int:
         return 0 if good and results.get("ended") == ["3-train", "4-freeze", "5-bake"] else 1
 
 
-def _told(work: Path) -> dict[str, Any]:
+def _read_results(work: Path) -> dict[str, Any]:
     """Results written by the last Blender."""
-    told = work / "told.json"
-    if not told.is_file():
+    file = work / "told.json"
+    if not file.is_file():
         return {"error": "a Blender ended without telling how it went"}
-    answer = json.loads(told.read_text())
-    told.unlink()
+    answer = json.loads(file.read_text())
+    file.unlink()
     return answer
 
 
@@ -109,14 +109,14 @@ def inside() -> None:
     import bpy
 
     plan = json.loads(os.environ[PLAN])
-    told: dict[str, Any] = {"blender": bpy.app.version_string, "longest_tick_ms": 0.0}
+    results: dict[str, Any] = {"blender": bpy.app.version_string, "longest_tick_ms": 0.0}
     if plan["turn"] == 0:
-        told = {}
-    play = {0: _set_up, 1: _first, 2: _second}[plan["turn"]](plan, told)
-    press.act(play, Path(plan["work"]), told if plan["turn"] != 1 else None)
+        results = {}
+    play = {0: _set_up, 1: _first, 2: _second}[plan["turn"]](plan, results)
+    press.act(play, Path(plan["work"]), results if plan["turn"] != 1 else None)
 
 
-def _set_up(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def _set_up(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     """Install the zip, set the backend up from the preferences, and save both for the next Blender."""
     import bpy
 
@@ -130,7 +130,7 @@ def _set_up(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     bpy.context.preferences.system.use_online_access = True
     began = time.monotonic()
     bpy.ops.extensions.package_install_files(filepath=plan["zip"], repo="user_default", enable_on_install=True)
-    told["install_seconds"] = round(time.monotonic() - began, 1)
+    results["install_seconds"] = round(time.monotonic() - began, 1)
     area = press._view(window)
     area.ui_type = "PREFERENCES"
     bpy.context.preferences.active_section = "ADDONS"
@@ -155,14 +155,14 @@ def _set_up(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
         if not taken and time.monotonic() - began > 20:
             yield from press._shoot(work, "c-set-up-running", settle=2)
             taken = True
-    told["set_up_seconds"] = round(time.monotonic() - began, 1)
+    results["set_up_seconds"] = round(time.monotonic() - began, 1)
     if preferences._setup is None or preferences._setup.failure:
         yield from press._shoot(work, "c-set-up-failed")
         raise RuntimeError(preferences._setup.failure if preferences._setup else "no set-up")
     while preferences._checks:
         yield 0.5
     yield 2.0
-    told["backend"] = list(preferences._findings)
+    results["backend"] = list(preferences._findings)
     yield from press._shoot(work, "d-set-up-done")
     bpy.ops.wm.save_userpref()
 
@@ -177,10 +177,10 @@ def _first(plan: dict[str, Any], _: dict[str, Any]) -> Iterator[float]:
     props = bpy.context.scene.splannequin
     props.clip, props.shot_path = plan["clip"], str(work / "sitting.splannequin")
     props.use_range, props.first, props.last = True, 1, plan["last"]
-    told: dict[str, Any] = {"ended": [], "longest_tick_ms": 0.0}
+    results: dict[str, Any] = {"ended": [], "longest_tick_ms": 0.0}
     for name, operator in press.STEPS[:2]:
         yield from press._click(operator)
-        yield from press._watch(work, name, told, cancel=False)
+        yield from press._watch(work, name, results, cancel=False)
     bpy.ops.wm.save_as_mainfile(filepath=str(work / "shot.blend"))
     yield from press._click("splannequin.train")
     watch = press._supervisor().watch_of(work / "sitting.splannequin")
@@ -195,13 +195,13 @@ def _first(plan: dict[str, Any], _: dict[str, Any]) -> Iterator[float]:
         yield 1.0
 
 
-def _second(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def _second(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     """Reopen the file: find the job, watch it until it ends, and finish the shot."""
     import bpy
 
     work = Path(plan["work"])
-    told["ended"] = []
-    press._time_ticks(told)
+    results["ended"] = []
+    press._time_ticks(results)
     window = bpy.context.window_manager.windows[0]
     bpy.context.preferences.use_preferences_save = False
     bpy.context.preferences.view.render_display_type = "NONE"
@@ -211,15 +211,15 @@ def _second(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     press._sidebar(area).active_panel_category = "Splannequin"
     yield 1.5
     watch = press._supervisor().watch_of(work / "sitting.splannequin")
-    told["found"] = watch.running()
+    results["found"] = watch.running()
     job = watch.jobs.get("train")
-    told["found_at"] = round(job.status.fraction, 3) if job is not None and job.status is not None else None
+    results["found_at"] = round(job.status.fraction, 3) if job is not None and job.status is not None else None
     yield from press._shoot(work, "9-found-again", settle=2)
-    yield from press._watch(work, "3-train", told, cancel=False)
+    yield from press._watch(work, "3-train", results, cancel=False)
     yield from _scrub(plan, work)
     for name, operator in press.STEPS[3:]:
         yield from press._click(operator)
-        yield from press._watch(work, name, told, cancel=False)
+        yield from press._watch(work, name, results, cancel=False)
     yield from press._show_results(work)
 
 

@@ -30,7 +30,7 @@ GOOD = (
 )  # fmt: skip
 
 
-def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def _play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     import bpy
 
     work = Path(plan["work"])
@@ -38,7 +38,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     shutil.copytree(plan["shot"], shot, ignore=shutil.ignore_patterns("jobs", "runs"))
     yield from press._arrange()
     scene = bpy.context.scene
-    own, render = scene.camera.name, scene.render
+    camera_name, render = scene.camera.name, scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = *SIZE, 50
     scene.frame_start = scene.frame_end = FRAME
     scene.frame_set(FRAME)
@@ -46,19 +46,19 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     for light in [o for o in scene.objects if o.type == "LIGHT"]:
         bpy.data.objects.remove(light)
     for operator in ("load_camera", "insert_freeze"):
-        told[operator] = str(_press(operator))
+        results[operator] = str(_press(operator))
         yield 1.0
-    told["size_kept"] = (render.resolution_x, render.resolution_y, render.resolution_percentage) == (*SIZE, 50)
-    yield from _cg(work, told)
-    yield from _grade(work, shot, told)
-    told["removed"] = str(_press("remove_shot"))
-    told["camera_back"] = scene.camera is not None and scene.camera.name == own
+    results["size_kept"] = (render.resolution_x, render.resolution_y, render.resolution_percentage) == (*SIZE, 50)
+    yield from _cg(work, results)
+    yield from _grade(work, shot, results)
+    results["removed"] = str(_press("remove_shot"))
+    results["camera_back"] = scene.camera is not None and scene.camera.name == camera_name
     bpy.context.window_manager.windows[0].workspace = bpy.data.workspaces["Layout"]
     yield 2.0
     yield from press._shoot(work, "11-removed")
 
 
-def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
+def _cg(work: Path, results: dict[str, Any]) -> Iterator[float]:
     """Insert at 50 % and render at 100 %: alone, with a cube, and with Only Moving."""
     import bpy
     import cube
@@ -70,7 +70,7 @@ def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
     scene.cycles.samples, scene.cycles.use_denoising = 1, False
     clean = _render(work, "half-at-full")
     border = np.concatenate([clean[:, :60].reshape(-1, 3), clean[:, -60:].reshape(-1, 3)])
-    told["filled"] = bool((border.max(axis=1) > 0.02).mean() > 0.9)
+    results["filled"] = bool((border.max(axis=1) > 0.02).mean() > 0.9)
     yield from _show(work, "11-half-at-full", "Rendering")
     _press("combine_cg")
     node = press.addon_module("bake.freeze_group").group_node(compat.compositor_tree(scene))
@@ -78,27 +78,27 @@ def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
     cube.put_cube(depth)
     scene.cycles.samples = 12
     layers = next(n for n in compat.compositor_tree(scene).nodes if n.bl_idname == "CompositorNodeRLayers")
-    alone = cube.see(layers.outputs["Image"], work, "cube")
+    cube_picture = cube.see(layers.outputs["Image"], work, "cube")
     compat.set_png(scene.render.image_settings)
     yield 0.5
     among = _render(work, "cube")
-    yield from _crop(work, among, alone[..., 3])
-    edge = (alone[..., 3] > 0.3) & (alone[..., 3] < 0.7)
-    solid = alone[..., 3] > 0.999
+    yield from _crop(work, among, cube_picture[..., 3])
+    edge = (cube_picture[..., 3] > 0.3) & (cube_picture[..., 3] < 0.7)
+    solid = cube_picture[..., 3] > 0.999
     changed = np.abs(among - clean).max(axis=2)
     seen = changed > 0.1
-    told["edge_soft"] = bool(edge.sum() > 50 and changed[edge & _beside(seen & solid)].mean() > 0.03)
+    results["edge_soft"] = bool(edge.sum() > 50 and changed[edge & _dilated(seen & solid)].mean() > 0.03)
     node.inputs["Only Moving"].default_value = 1.0
     moving = _render(work, "only-moving")
-    told["cube_kept"] = bool(np.abs(moving - among)[solid & seen].max(axis=1).mean() < 0.05)
-    told["only_moving_differs"] = round(float((np.abs(moving - among).max(axis=2) > 0.2).mean()), 4)
-    told["moved_once"] = told["only_moving_differs"] < 0.003  # 0.01 if the plate shows a hand a second time
+    results["cube_kept"] = bool(np.abs(moving - among)[solid & seen].max(axis=1).mean() < 0.05)
+    results["only_moving_differs"] = round(float((np.abs(moving - among).max(axis=2) > 0.2).mean()), 4)
+    results["moved_once"] = results["only_moving_differs"] < 0.003  # 0.01 if the plate shows a hand a second time
     yield from _show(work, "11-only-moving", "Rendering")
     bpy.data.objects.remove(next(o for o in scene.objects if o.type == "MESH" and not o.hide_render))
     _press("remove_shot")
 
 
-def _beside(mask: Any) -> Any:
+def _dilated(mask: Any) -> Any:
     """Mask dilated by two pixels."""
     import numpy as np
 
@@ -109,7 +109,7 @@ def _beside(mask: Any) -> Any:
     return found
 
 
-def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
+def _grade(work: Path, shot: Path, results: dict[str, Any]) -> Iterator[float]:
     """Artist's comp that removes the plate's colours: insert the freeze between the nodes, and remove it."""
     import bpy
     import numpy as np
@@ -140,10 +140,10 @@ def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
     _press("load_camera")
     _press("insert_freeze")
     node = press.addon_module("bake.freeze_group").group_node(tree)
-    told["as_plate"] = grade.inputs["Image"].links[0].from_node == node
+    results["as_plate"] = grade.inputs["Image"].links[0].from_node == node
     graded = _render(work, "graded")
-    told["grade_kept"] = bool(np.ptp(graded, axis=2).max() < 0.02)
-    told["frozen"] = bool(np.abs(graded - mine).mean() > 0.005)
+    results["grade_kept"] = bool(np.ptp(graded, axis=2).max() < 0.02)
+    results["frozen"] = bool(np.abs(graded - mine).mean() > 0.005)
     window = bpy.context.window_manager.windows[0]
     window.workspace = bpy.data.workspaces["Compositing"]
     yield 2.0
@@ -157,7 +157,7 @@ def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
         bpy.ops.node.view_all()
     yield from _show(work, "11-as-plate", "Compositing")
     compositor.remove(scene)
-    told["links_back"] = sorted((k.from_node.name, k.to_node.name) for k in tree.links) == links
+    results["links_back"] = sorted((k.from_node.name, k.to_node.name) for k in tree.links) == links
 
 
 def _press(operator: str) -> set[str]:
@@ -218,6 +218,6 @@ def _show(work: Path, name: str, workspace: str, image: Any = None) -> Iterator[
 
 if __name__ == "__main__":
     needs = "shot of the bundled clip with a take"
-    code = press.on_a_shot(__file__, __doc__ or "", _play, needs, ":91", lambda told: all(map(told.get, GOOD)))
+    code = press.on_a_shot(__file__, __doc__ or "", _play, needs, ":91", lambda results: all(map(results.get, GOOD)))
     if "bpy" not in sys.modules:
         sys.exit(code)

@@ -45,10 +45,10 @@ def main() -> int:
     plan = {"zip": str(Path(args.zip).absolute()), "clip": str(Path(args.clip).absolute()), "last": args.last}
     with tempfile.TemporaryDirectory(prefix="splannequin-profile-") as profile:
         os.environ["BLENDER_USER_RESOURCES"] = profile
-        told = press._host(__file__, plan, args)
-    Path(args.output, "first_minutes.json").write_text(json.dumps(told, indent=1))
-    good = told.get("ended") == [name for name, _ in press.STEPS] and told.get("searches") == 0
-    return 0 if good and "error" not in told else 1
+        results = press._host(__file__, plan, args)
+    Path(args.output, "first_minutes.json").write_text(json.dumps(results, indent=1))
+    good = results.get("ended") == [name for name, _ in press.STEPS] and results.get("searches") == 0
+    return 0 if good and "error" not in results else 1
 
 
 # ------------------------------------------------------------------------------------------------- inside Blender
@@ -57,25 +57,25 @@ def main() -> int:
 class Record:
     """Records the seconds of each stage and the sentences that the panel shows in it."""
 
-    def __init__(self, told: dict[str, Any], work: Path) -> None:
-        self.told, self.work = told, work
-        self.told.update(seconds={}, sentences={}, ended=[], searches=0, longest_tick_ms=0.0)
+    def __init__(self, results: dict[str, Any], work: Path) -> None:
+        self.results, self.work = results, work
+        self.results.update(seconds={}, sentences={}, ended=[], searches=0, longest_tick_ms=0.0)
         self.stage, self.began, self.seen = "", time.monotonic(), set[str]()
 
     def enter(self, stage: str) -> None:
         """End the current stage and begin another."""
         now = time.monotonic()
         if self.stage:
-            self.told["seconds"][self.stage] = round(now - self.began, 1)
+            self.results["seconds"][self.stage] = round(now - self.began, 1)
         self.stage, self.began, self.seen = stage, now, set()
-        (self.work / "told.json").write_text(json.dumps(self.told))  # partial results, in case Blender is ended
+        (self.work / "told.json").write_text(json.dumps(self.results))  # partial results, in case Blender is ended
 
     def hear(self, text: str) -> None:
         """Record a sentence once per stage; sentences that differ only in numbers count as equal."""
         alike = re.sub(r"\d+(\.\d+)?", "0", text)
         if text and alike not in self.seen:
             self.seen.add(alike)
-            self.told["sentences"].setdefault(self.stage, []).append(text)
+            self.results["sentences"].setdefault(self.stage, []).append(text)
 
 
 def listen(record: Record) -> None:
@@ -98,12 +98,12 @@ def listen(record: Record) -> None:
     panel.tr = said
 
 
-def count_searches(told: dict[str, Any]) -> None:
+def count_searches(results: dict[str, Any]) -> None:
     """Count the cases in which a button was out of sight, so that a step was opened or the panel scrolled."""
 
     def counted(act: Callable[..., Iterator[float]]) -> Callable[..., Iterator[float]]:
         def do(*args: Any) -> Iterator[float]:
-            told["searches"] += 1
+            results["searches"] += 1
             yield from act(*args)
 
         return do
@@ -111,18 +111,18 @@ def count_searches(told: dict[str, Any]) -> None:
     press._unfold, press._scroll_down = counted(press._unfold), counted(press._scroll_down)
 
 
-def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
     work = Path(plan["work"])
-    record = Record(told, work)
+    record = Record(results, work)
     clip = Path(shutil.copy(plan["clip"], work / "sitting.mp4"))
     record.enter("install")
     bpy.ops.extensions.package_install_files(filepath=plan["zip"], repo="user_default", enable_on_install=True)
-    press._time_ticks(told)
+    press._time_ticks(results)
     listen(record)
-    count_searches(told)
+    count_searches(results)
     record.enter("open the tab")
     yield from press._arrange()
     yield from press._shoot(work, "01-tab")
@@ -137,12 +137,12 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     for name, operator in press.STEPS:
         if name == "4-freeze":
             record.enter("scrub")
-            yield from scrub(work, told)
+            yield from scrub(work, results)
         record.enter(name)
         yield from press._click(operator)
-        told["seconds"][f"{name}: click"] = round(time.monotonic() - record.began, 1)
-        yield from press._watch(work, name, told, cancel=False)
-        if told["ended"][-1:] != [name]:
+        results["seconds"][f"{name}: click"] = round(time.monotonic() - record.began, 1)
+        yield from press._watch(work, name, results, cancel=False)
+        if results["ended"][-1:] != [name]:
             return
         record.enter(f"{name}: done")
         yield 2.0
@@ -152,7 +152,7 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     record.enter("")
 
 
-def scrub(work: Path, told: dict[str, Any]) -> Iterator[float]:
+def scrub(work: Path, results: dict[str, Any]) -> Iterator[float]:
     """Scrub from end to end, and set t* to the shown frame."""
     import bpy
 
@@ -162,7 +162,7 @@ def scrub(work: Path, told: dict[str, Any]) -> Iterator[float]:
         if viewport.failure() or time.monotonic() - began > 60:
             raise RuntimeError(" ".join(viewport.failure() or ("the backend never was ready to scrub",)))
         yield 0.2
-    told["seconds"]["scrub: ready"] = round(time.monotonic() - began, 1)
+    results["seconds"]["scrub: ready"] = round(time.monotonic() - began, 1)
     yield 3.0
     yield from press._shoot(work, "3b-scrub")
     scene = bpy.context.scene
@@ -182,8 +182,8 @@ def inside() -> None:
     import bpy
 
     plan = json.loads(os.environ[press.PLAN])
-    told: dict[str, Any] = {"blender": bpy.app.version_string}
-    press.act(play(plan, told), Path(plan["work"]), told)
+    results: dict[str, Any] = {"blender": bpy.app.version_string}
+    press.act(play(plan, results), Path(plan["work"]), results)
 
 
 if __name__ == "__main__":

@@ -63,20 +63,20 @@ class _Artist:
         cloud = self.scene.splannequin.made[0].points
         side, chosen = press._sidebar(self.area), []
         seen = [(v.co.copy(), cloud.matrix_world @ v.co) for v in cloud.data.vertices]
-        pixels = [self.at(p) if _ahead(self.region, p) else (-9, -9) for _, p in seen]
+        pixels = [self.at(p) if _is_in_front(self.region, p) else (-9, -9) for _, p in seen]
         for (local, _), (x, y) in zip(seen, pixels, strict=True):
             inside = self.region.x + 120 < x < side.x - 60 and self.region.y + 90 < y < self.region.y + 500
-            alone = inside and sum(abs(a - x) < 5 and abs(b - y) < 5 for a, b in pixels) == 1
-            if alone and all(abs(self.at(cloud.matrix_world @ c)[0] - x) > 60 for c in chosen):
+            is_isolated = inside and sum(abs(a - x) < 5 and abs(b - y) < 5 for a, b in pixels) == 1
+            if is_isolated and all(abs(self.at(cloud.matrix_world @ c)[0] - x) > 60 for c in chosen):
                 chosen.append(local)
         return chosen[:4]
 
 
-def _ahead(region: Any, place: Any) -> bool:
+def _is_in_front(region: Any, place: Any) -> bool:
     return (region.data.perspective_matrix @ place.to_4d()).w > 0.01
 
 
-def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def _play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     import bpy
 
     work = Path(plan["work"])
@@ -88,7 +88,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
         bpy.ops.splannequin.load_camera()
     yield 1.5
     picks = artist.points()
-    told["points"] = len(picks)
+    results["points"] = len(picks)
     cloud = scene.splannequin.made[0].points
 
     def world(n: int) -> Any:
@@ -105,26 +105,28 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     yield 0.5
     yield from press._shoot(work, "10-point-under-the-mouse")
     yield from artist.press("ESC", x, y)
-    told["escape_changes_nothing"] = free() and scene.splannequin.made[0].points.matrix_world == stood
+    results["escape_changes_nothing"] = free() and scene.splannequin.made[0].points.matrix_world == stood
     artist.invoke("align_origin")
     yield 0.3
     yield from artist.press("LEFTMOUSE", *artist.at(world(0)))
-    told["origin"] = free() and world(0).length < 1e-4
+    results["origin"] = free() and world(0).length < 1e-4
     artist.invoke("align_floor")
     yield 0.3
     for n in (1, 2, 3):
         yield from artist.press("LEFTMOUSE", *artist.at(world(n)))
         if n == 2:
             yield from artist.press("BACK_SPACE", *artist.at(world(n)))
-            told["backspace"] = len(press.addon_module("solve.align_operators").picking().picked) == 1
+            results["backspace"] = len(press.addon_module("solve.align_operators").picking().picked) == 1
             yield from artist.press("LEFTMOUSE", *artist.at(world(n)))
             yield from press._shoot(work, "10-two-of-three")
-    told["floor"] = free() and max(abs(world(n).z) for n in (1, 2, 3)) < 1e-4
+    results["floor"] = free() and max(abs(world(n).z) for n in (1, 2, 3)) < 1e-4
     with bpy.context.temp_override(window=artist.window):
         bpy.ops.ed.undo()
     yield 0.5
     scene = artist.scene = bpy.context.window_manager.windows[0].scene
-    told["undo_takes_the_floor_back_alone"] = world(0).length < 1e-4 and max(abs(world(n).z) for n in (1, 2, 3)) > 1e-3
+    results["undo_takes_the_floor_back_alone"] = (
+        world(0).length < 1e-4 and max(abs(world(n).z) for n in (1, 2, 3)) > 1e-3
+    )
     artist.invoke("align_scale")
     yield 0.3
     for n in (1, 2):
@@ -134,9 +136,9 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     artist.window.event_simulate(type="RET", value="PRESS", x=x, y=y)
     artist.window.event_simulate(type="RET", value="RELEASE", x=x, y=y)
     yield 0.5
-    told["last_operator"] = [o.bl_idname for o in bpy.context.window_manager.operators][-1:]
-    told["scale"] = list(scene.splannequin.made[0].root.scale)
-    failed = [name for name, value in told.items() if value is False]
+    results["last_operator"] = [o.bl_idname for o in bpy.context.window_manager.operators][-1:]
+    results["scale"] = list(scene.splannequin.made[0].root.scale)
+    failed = [name for name, value in results.items() if value is False]
     if failed:
         raise RuntimeError(f"not as it should be: {', '.join(failed)}")
 

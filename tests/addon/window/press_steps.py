@@ -56,9 +56,9 @@ def _host(script: str, plan: dict, args: argparse.Namespace) -> dict:
         with screen(args.display):
             blender = subprocess.Popen(command(args.blender, script), env=environ)
             _serve(blender, Path(work), output, environ, args.limit)
-        told = Path(work) / "told.json"
+        results_file = Path(work) / "told.json"
         lacking = {"error": "Blender ended without telling how it went."}
-        results = json.loads(told.read_text()) if told.is_file() else lacking
+        results = json.loads(results_file.read_text()) if results_file.is_file() else lacking
     print(json.dumps(results, indent=1))
     return results
 
@@ -71,12 +71,12 @@ def on_a_shot(
     display: str,
     good: Callable[[dict], bool] = lambda results: True,
 ) -> int:
-    """Run either side of a script on one shot: the host, or, inside Blender, `play(plan, told)`.
+    """Run either side of a script on one shot: the host, or, inside Blender, `play(plan, results)`.
 
     Args:
         script: file of the script that Blender runs.
         text: description of the script, for --help.
-        play: script of the artist; `plan` holds the shot's folder and a work folder, and `told` is printed at the end.
+        play: script of the artist; `plan` holds the shot's folder and a work folder, and `results` are printed last.
         needs: requirements on the shot, for --help.
         display: X display to open.
         good: whether the results are a success, provided that nothing failed.
@@ -88,8 +88,8 @@ def on_a_shot(
         import bpy
 
         plan = json.loads(os.environ[PLAN])
-        told = {"blender": bpy.app.version_string}
-        act(play(plan, told), Path(plan["work"]), told)
+        report = {"blender": bpy.app.version_string}
+        act(play(plan, report), Path(plan["work"]), report)
         return 0
     parser = argparse.ArgumentParser(description=text.partition("\n")[0])
     parser.add_argument("--blender", required=True, help="Blender with the extension installed")
@@ -164,8 +164,8 @@ def inside() -> None:
     act(_play(plan), Path(plan["work"]), None)
 
 
-def act(play: Iterator[float], work: Path, told: dict | None) -> None:
-    """Advance a script, which yields the seconds to wait; write `told` to the work folder and quit Blender."""
+def act(play: Iterator[float], work: Path, results: dict | None) -> None:
+    """Advance a script, which yields the seconds to wait; write `results` to the work folder and quit Blender."""
     import bpy
 
     def turn() -> float | None:
@@ -175,10 +175,10 @@ def act(play: Iterator[float], work: Path, told: dict | None) -> None:
             pass
         except Exception as error:  # any error is reported, and Blender must not stay open until the time limit
             traceback.print_exc()
-            if told is not None:
-                told["error"] = f"{type(error).__name__}: {error}"
-        if told is not None:
-            (work / "told.json").write_text(json.dumps(told))
+            if results is not None:
+                results["error"] = f"{type(error).__name__}: {error}"
+        if results is not None:
+            (work / "told.json").write_text(json.dumps(results))
         bpy.ops.wm.quit_blender()
         return None
 
@@ -190,8 +190,8 @@ def _play(plan: dict) -> Iterator[float]:
     import bpy
 
     work = Path(plan["work"])
-    told: dict = {"blender": bpy.app.version_string, "ended": [], "longest_tick_ms": 0.0}
-    _time_ticks(told)
+    results: dict = {"blender": bpy.app.version_string, "ended": [], "longest_tick_ms": 0.0}
+    _time_ticks(results)
     yield from _arrange()
     scene = bpy.context.scene
     props = scene.splannequin
@@ -207,14 +207,14 @@ def _play(plan: dict) -> Iterator[float]:
             yield 0.5
         for attempt in range(2 if plan["stop_train"] and name == "3-train" else 1):
             yield from _click(operator)
-            yield from _watch(work, name, told, cancel=plan["stop_train"] and name == "3-train" and attempt == 0)
-        (work / "told.json").write_text(json.dumps(told))
-        if told["ended"][-1:] != [name]:
+            yield from _watch(work, name, results, cancel=plan["stop_train"] and name == "3-train" and attempt == 0)
+        (work / "told.json").write_text(json.dumps(results))
+        if results["ended"][-1:] != [name]:
             return
     yield from _show_results(work)
 
 
-def _time_ticks(told: dict) -> None:
+def _time_ticks(results: dict) -> None:
     """Record the longest time for which the add-on's timer blocks Blender's main thread."""
     import bpy
 
@@ -224,7 +224,7 @@ def _time_ticks(told: dict) -> None:
     def timed() -> float:
         began = time.perf_counter()
         pause = tick()
-        told["longest_tick_ms"] = max(told["longest_tick_ms"], round(1000 * (time.perf_counter() - began), 1))
+        results["longest_tick_ms"] = max(results["longest_tick_ms"], round(1000 * (time.perf_counter() - began), 1))
         return pause
 
     bpy.app.timers.register(timed, persistent=True)
@@ -361,8 +361,8 @@ def _under_mouse(window, area, region) -> str:
     return manager.clipboard
 
 
-def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
-    """Wait until the step ends; take a picture during it and one after. Record the outcome in `told`."""
+def _watch(work: Path, name: str, results: dict, cancel: bool) -> Iterator[float]:
+    """Wait until the step ends; take a picture during it and one after. Record the outcome in `results`."""
     import bpy
 
     watch = _supervisor().watch_of(work / "sitting.splannequin")
@@ -388,11 +388,11 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
     bad = [j.status.message for j in watch.jobs.values() if j.state != "done" and j.status is not None]
     failures = [sentence for sentence, _ in watch.failures.values()]
     if bad or failures:
-        told.setdefault("failed", []).extend([*bad, *failures])
+        results.setdefault("failed", []).extend([*bad, *failures])
     else:
-        told["ended"].append(name)
-    told.setdefault("seconds", {})[name] = round(time.monotonic() - began, 1)
-    told["frame"] = bpy.context.scene.frame_current
+        results["ended"].append(name)
+    results.setdefault("seconds", {})[name] = round(time.monotonic() - began, 1)
+    results["frame"] = bpy.context.scene.frame_current
 
 
 def _supervisor():

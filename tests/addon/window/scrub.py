@@ -22,7 +22,7 @@ import press_steps as press
 SWEEP_SECONDS = 10.0
 
 
-def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def _play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     import bpy
 
     work = Path(plan["work"])
@@ -30,7 +30,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     scene = bpy.context.scene
     scene.splannequin.shot_path = plan["shot"]
     viewport = press.addon_module("freeze.viewport")
-    stalls = _time(viewport, told)
+    stalls = _time(viewport, results)
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.splannequin.load_camera()
     yield 1.0
@@ -44,17 +44,17 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
             yield from press._shoot(work, "8-scrub-failed")
             raise RuntimeError("the backend never was ready")
         yield 0.1
-    told["ready_seconds"] = round(time.monotonic() - since, 2)
+    results["ready_seconds"] = round(time.monotonic() - since, 2)
     session = viewport.session()
-    told["facts"] = {k: session.facts[k] for k in ("gaussians", "moving", "suggestions", "width", "height")}
+    results["facts"] = {k: session.facts[k] for k in ("gaussians", "moving", "suggestions", "width", "height")}
     scene.splannequin.choose_t_star = True
     trained = session.facts["trained"]
     scene.splannequin.t_star = trained[len(trained) // 2]
-    told["detail_seconds"] = [(yield from _detailed(session))]
+    results["detail_seconds"] = [(yield from _detailed(session))]
     yield from press._scroll_down()  # to the part of the step that is shown while scrubbing
     yield from press._shoot(work, "8-scrub-camera")
-    told["sharp_width"] = max(frame.rgba.shape[1] for frame in session.frames.values())
-    told["covered"] = round(min(float(frame.rgba[..., 3].mean()) for frame in session.frames.values()), 3)
+    results["sharp_width"] = max(frame.rgba.shape[1] for frame in session.frames.values())
+    results["covered"] = round(min(float(frame.rgba[..., 3].mean()) for frame in session.frames.values()), 3)
     stalls.clear()
     for name, change in _sweeps(scene, trained):
         began, drawn, n = time.monotonic(), session.drawn, 0
@@ -63,20 +63,20 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
             n += 1
             yield 0.001
         spent = time.monotonic() - began
-        told[name] = {"frozen_views_per_second": round((session.drawn - drawn) / spent, 1), "asked": n}
-    told["main_thread_ms"] = {name: round(1000 * max(times), 1) for name, times in stalls.items()}
-    told["main_thread_mean_ms"] = {name: round(1000 * sum(t) / len(t), 2) for name, t in stalls.items()}
-    told["sweep_size"] = min((f.rgba.shape[1], f.rgba.shape[0]) for f in session.frames.values())
-    yield from _free_view(scene, work, session, told)
+        results[name] = {"frozen_views_per_second": round((session.drawn - drawn) / spent, 1), "asked": n}
+    results["main_thread_ms"] = {name: round(1000 * max(times), 1) for name, times in stalls.items()}
+    results["main_thread_mean_ms"] = {name: round(1000 * sum(t) / len(t), 2) for name, t in stalls.items()}
+    results["sweep_size"] = min((f.rgba.shape[1], f.rgba.shape[0]) for f in session.frames.values())
+    yield from _free_view(scene, work, session, results)
     scene.splannequin.live_show = "guesses"
-    yield from _tinted(session, told["sharp_width"])
+    yield from _tinted(session, results["sharp_width"])
     yield from press._shoot(work, "8-scrub-guesses")
     pid = session._process.pid
     yield from press._click("splannequin.live")
     since = time.monotonic()
     while session._process.poll() is None and time.monotonic() - since < 10:
         yield 0.05
-    told["ended"] = {"pid": pid, "exit_code": session._process.poll()}
+    results["ended"] = {"pid": pid, "exit_code": session._process.poll()}
 
 
 def _sweeps(scene: Any, trained: list[int]) -> list[tuple[str, Callable[[int], None]]]:
@@ -113,7 +113,7 @@ def _tinted(session: Any, width: int) -> Iterator[float]:
     yield 0.5
 
 
-def _free_view(scene: Any, work: Path, session: Any, told: dict[str, Any]) -> Iterator[float]:
+def _free_view(scene: Any, work: Path, session: Any, results: dict[str, Any]) -> Iterator[float]:
     """Show a free view with a cube in its centre."""
     import bpy
     from mathutils import Vector
@@ -132,11 +132,11 @@ def _free_view(scene: Any, work: Path, session: Any, told: dict[str, Any]) -> It
         turn.view_location = middle
         turn.view_rotation = scene.camera.matrix_world.to_quaternion()
         turn.view_distance = 0.9 * (scene.camera.matrix_world.translation - middle).length
-    told["detail_seconds"].append((yield from _detailed(session)))
+    results["detail_seconds"].append((yield from _detailed(session)))
     yield from press._shoot(work, "8-scrub-free")
 
 
-def _time(viewport: Any, told: dict[str, Any]) -> dict[str, list[float]]:
+def _time(viewport: Any, results: dict[str, Any]) -> dict[str, list[float]]:
     """Time all functions of the extension on Blender's main thread: seconds by name, filled while it runs."""
     import bpy
 

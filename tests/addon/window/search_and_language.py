@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import press_steps as press
 
 
-def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def _play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     import bpy
 
     work = Path(plan["work"])
@@ -34,12 +34,12 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     yield from _search("load camera")
     yield from _press("RET", 1)
     yield 2.0
-    told["loaded"] = len(bpy.data.cameras) == before + 1
+    results["loaded"] = len(bpy.data.cameras) == before + 1
 
     view = bpy.context.preferences.view
     view.language = "de_DE"
     view.use_translate_interface = view.use_translate_tooltips = view.use_translate_reports = True
-    told["german"] = bpy.app.translations.pgettext_iface("Import Clip") == "Clip importieren"
+    results["german"] = bpy.app.translations.pgettext_iface("Import Clip") == "Clip importieren"
     for area in bpy.context.window_manager.windows[0].screen.areas:
         area.tag_redraw()
     yield 1.0
@@ -50,7 +50,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.ed.undo()
     yield 1.0
-    told["undone"] = len(bpy.data.cameras) == before
+    results["undone"] = len(bpy.data.cameras) == before
 
 
 def _search(text: str) -> Iterator[float]:
@@ -87,7 +87,7 @@ if __name__ == "__main__":
         _play,
         "shot folder with a take",
         ":97",
-        good=lambda told: bool(told.get("loaded") and told.get("undone") and told.get("german")),
+        good=lambda results: bool(results.get("loaded") and results.get("undone") and results.get("german")),
     )
     if "bpy" not in sys.modules:
         sys.exit(status)

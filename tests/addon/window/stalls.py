@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import press_steps as press
 
-TOLD_MS = 10.0
+REPORTED_MS = 10.0
 FRAMES = 6
 
 
-def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def _play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     import bpy
 
     shot = Path(plan["work"]) / "stalls.splannequin"
@@ -34,10 +34,10 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     yield from press._arrange()
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end, scene.render.resolution_percentage = 1, 1, 10
-    told["blender_render_start"] = []
+    results["blender_render_start"] = []
     for n in range(3):
         scene.render.filepath = str(shot.parent / "own" / str(n)) + "/"
-        told["blender_render_start"].append(_timed(lambda: bpy.ops.render.render("INVOKE_DEFAULT", animation=True)))
+        results["blender_render_start"].append(_timed(lambda: bpy.ops.render.render("INVOKE_DEFAULT", animation=True)))
         yield from _rendered()
     scene.render.filepath, scene.render.resolution_percentage = "/tmp/", 100  # noqa: S108  (what a new file has)
     scene.splannequin.shot_path = str(shot)
@@ -45,16 +45,16 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     (shot / "takes" / scene.splannequin.take_name / "000003.exr").unlink()  # a missing frame, so that Freeze has work
     yield 1.0
     calls: list[tuple[str, float]] = []
-    told["turns"] = []
+    results["turns"] = []
     _watch_calls(calls)
-    _watch_turns(calls, told["turns"])
-    told["load_camera"] = []
+    _watch_turns(calls, results["turns"])
+    results["load_camera"] = []
     for _ in range(2):
         calls.clear()
         before = _from_disk()
         with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
             spent = _timed(bpy.ops.splannequin.load_camera)
-        told["load_camera"].append({"ms": spent, "from_disk": _from_disk() - before, "in": _longest(calls)})
+        results["load_camera"].append({"ms": spent, "from_disk": _from_disk() - before, "in": _longest(calls)})
         yield 1.0
     scene.frame_start, scene.frame_end = 1, FRAMES
     for _ in range(6):  # scrolls to the last panel; searching its button from the top takes minutes
@@ -66,7 +66,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
         yield 0.2
     if watch.failures:
         raise RuntimeError(str(watch.failures))
-    told["rendered"] = len(list((shot / "bake").rglob("*.png")))
+    results["rendered"] = len(list((shot / "bake").rglob("*.png")))
 
 
 def _rendered() -> Iterator[float]:
@@ -138,7 +138,7 @@ def _watch_turns(calls: list[tuple[str, float]], turns: list[dict[str, Any]]) ->
         before, began = _from_disk(), time.perf_counter()
         pause = tick()
         spent = 1000 * (time.perf_counter() - began)
-        if spent > TOLD_MS:
+        if spent > REPORTED_MS:
             turns.append({"ms": round(spent, 1), "from_disk": _from_disk() - before, "in": _longest(calls)})
         return pause
 

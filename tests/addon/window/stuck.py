@@ -30,7 +30,7 @@ import press_steps as press
 PLAN = "SPLANNEQUIN_STUCK_PLAN"
 ROOT = Path(__file__).resolve().parents[3]
 WORLD = "from pathlib import Path; from tests.backend.conftest import build_world; build_world(Path({!r}))"
-HELD = {
+CHECKS = {
     "set_up_offered", "plate_seen", "scene_camera_kept", "scale_asked_for", "scale_known", "suggested",
     "stopped_at_work", "moved", "missed", "located",
 }  # fmt: skip
@@ -59,10 +59,10 @@ def main() -> int:
             command = press.command(args.blender, __file__)
             blender = subprocess.Popen(command, env={**environ, PLAN: json.dumps(plan)})
             press._serve(blender, work, output, environ, args.limit)
-        told = work / "told.json"
-        results = json.loads(told.read_text()) if told.is_file() else {"error": "Blender told nothing"}
+        results_file = work / "told.json"
+        results = json.loads(results_file.read_text()) if results_file.is_file() else {"error": "Blender told nothing"}
     print(json.dumps(results, indent=1))
-    lacking = sorted(name for name in HELD if results.get(name) is not True)
+    lacking = sorted(name for name in CHECKS if results.get(name) is not True)
     print("did not hold: " + ", ".join(lacking) if lacking else "all of it held")
     return 1 if lacking or "error" in results else 0
 
@@ -97,11 +97,11 @@ def inside() -> None:
     import bpy
 
     plan = json.loads(os.environ[PLAN])
-    told: dict[str, Any] = {"blender": bpy.app.version_string}
-    press.act(_play(plan, told), Path(plan["work"]), told)
+    results: dict[str, Any] = {"blender": bpy.app.version_string}
+    press.act(_play(plan, results), Path(plan["work"]), results)
 
 
-def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+def _play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
     """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
@@ -109,31 +109,31 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     yield from press._arrange()
     bpy.context.preferences.view.filebrowser_display_type = "SCREEN"
     bpy.context.preferences.system.use_online_access = True
-    yield from _no_backend(work, told)
+    yield from _no_backend(work, results)
     os.environ["SPLANNEQUIN_BACKEND_PYTHON"] = plan["backend"]
     press._supervisor()._backend = (None, 0.0)
-    yield from _imported(work, told)
-    yield from _solved(work, told)
-    yield from _scrubbed(work, told)
-    yield from _moved(work, told)
-    yield from _renamed(work, told)
+    yield from _imported(work, results)
+    yield from _solved(work, results)
+    yield from _scrubbed(work, results)
+    yield from _moved(work, results)
+    yield from _renamed(work, results)
     yield from _preferences(work)
 
 
-def _no_backend(work: Path, told: dict[str, Any]) -> Iterator[float]:
+def _no_backend(work: Path, results: dict[str, Any]) -> Iterator[float]:
     """The red box contains the button that helps; the button asks before it downloads."""
     import bpy
 
     yield from press._shoot(work, "11-no-backend")
     yield from press._click("splannequin.set_up")
-    told["set_up_offered"] = True
+    results["set_up_offered"] = True
     window = bpy.context.window_manager.windows[0]
     for value in ("PRESS", "RELEASE"):
         window.event_simulate(type="ESC", value=value, x=300, y=500)
     yield 1.0
 
 
-def _imported(work: Path, told: dict[str, Any]) -> Iterator[float]:
+def _imported(work: Path, results: dict[str, Any]) -> Iterator[float]:
     """The clip is visible after its import; the cube and the scene's camera are unchanged."""
     import bpy
 
@@ -147,12 +147,14 @@ def _imported(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield from _ended(shot)
     camera = press.addon_module("footage.plate").find(scene, shot)
     space = press._view(bpy.context.window_manager.windows[0]).spaces.active
-    told["plate_seen"] = camera is not None and space.camera == camera and space.region_3d.view_perspective == "CAMERA"
-    told["scene_camera_kept"] = scene.camera == mine
+    results["plate_seen"] = (
+        camera is not None and space.camera == camera and space.region_3d.view_perspective == "CAMERA"
+    )
+    results["scene_camera_kept"] = scene.camera == mine
     yield from press._shoot(work, "11-imported", settle=0)
 
 
-def _solved(work: Path, told: dict[str, Any]) -> Iterator[float]:
+def _solved(work: Path, results: dict[str, Any]) -> Iterator[float]:
     """Open a solved and trained shot: the costs of the presets, and the request for the scale."""
     import bpy
 
@@ -162,7 +164,7 @@ def _solved(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield from press._click("splannequin.load_camera")
     yield 1.0
     scaled = press.addon_module("solve.scale").scaled
-    told["scale_asked_for"] = not scaled(scene, shot)
+    results["scale_asked_for"] = not scaled(scene, shot)
     yield from press._shoot(work, "11-presets-and-scale", settle=0)
     for name, x in (("one", 0.0), ("other", 1.0)):
         bpy.context.view_layer.objects.active = None
@@ -172,10 +174,10 @@ def _solved(work: Path, told: dict[str, Any]) -> Iterator[float]:
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.splannequin.align_scale(places=(0, 0, 0, 1, 0, 0), distance=1.0)
     yield 1.0
-    told["scale_known"] = scaled(scene, shot)
+    results["scale_known"] = scaled(scene, shot)
 
 
-def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
+def _scrubbed(work: Path, results: dict[str, Any]) -> Iterator[float]:
     """An unset t* uses the suggested instant and says so; scrubbing stops during a training."""
     import bpy
 
@@ -184,8 +186,8 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield from press._click("splannequin.live")
     yield from _until(lambda: viewport.session() is not None and viewport.session().facts, 90, "the session")
     yield 2.0
-    told["suggested"] = not props.choose_t_star and props.t_star == viewport.instant(scene)
-    told["t_star"] = props.t_star
+    results["suggested"] = not props.choose_t_star and props.t_star == viewport.instant(scene)
+    results["t_star"] = props.t_star
     yield from press._scroll_down()
     yield from press._shoot(work, "11-suggested")
     props.extend_steps = 30000  # long enough that the training still runs when the pause button is found
@@ -197,7 +199,7 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield from press._shoot(work, "11-stop-scrubbing", settle=0)
     yield from press._click("splannequin.live")
     yield 1.0
-    told["stopped_at_work"] = viewport.session() is None and watch.running() == "train"
+    results["stopped_at_work"] = viewport.session() is None and watch.running() == "train"
     yield from _scroll_up()
     yield from press._click("splannequin.cancel")
     press._move(bpy.context.window_manager.windows[0], 400, 300)  # the sidebar is laid out without the mouse over it
@@ -205,27 +207,27 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield from press._shoot(work, "11-laid-out", settle=0)
 
 
-def _moved(work: Path, told: dict[str, Any]) -> Iterator[float]:
+def _moved(work: Path, results: dict[str, Any]) -> Iterator[float]:
     """Move the whole project folder."""
     import bpy
 
     bpy.ops.wm.save_as_mainfile(filepath=str(work / "project" / "work.blend"))
     yield 0.5
-    there = (work / "project").rename(work / "moved")
-    yield from _opened(there / "work.blend")
+    destination = (work / "project").rename(work / "moved")
+    yield from _opened(destination / "work.blend")
     scene = bpy.context.scene
     folder = press.addon_module("shot.selection").shot_folder(scene)
     camera = press.addon_module("solve.cameras").find(scene, folder, "CAMERA")
-    told["moved"] = folder == there / "tiny.splannequin" and camera is not None and scene.camera == camera
+    results["moved"] = folder == destination / "tiny.splannequin" and camera is not None and scene.camera == camera
     yield from press._shoot(work, "11-moved")
 
 
-def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
+def _renamed(work: Path, results: dict[str, Any]) -> Iterator[float]:
     """Rename only the shot folder: the panel reports it missing, and Locate finds it."""
     import bpy
 
-    before, there = work / "moved" / "tiny.splannequin", work / "moved" / "renamed.splannequin"
-    before.rename(there)
+    before, destination = work / "moved" / "tiny.splannequin", work / "moved" / "renamed.splannequin"
+    before.rename(destination)
     watch = press._supervisor().watch_of(before)
     yield from _until(
         lambda: press.addon_module("shot.selection").missing(bpy.context.scene, watch.state),
@@ -233,21 +235,23 @@ def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
         "the shot to be missed",
     )
     yield 1.0
-    told["missed"] = not before.exists()
+    results["missed"] = not before.exists()
     yield from press._shoot(work, "11-missing")
     yield from press._click("splannequin.locate_shot")
     yield 1.5
     window = bpy.context.window_manager.windows[0]
     area = next(a for a in window.screen.areas if a.type == "FILE_BROWSER")
-    area.spaces.active.params.directory = os.fsencode(f"{there}/")
+    area.spaces.active.params.directory = os.fsencode(f"{destination}/")
     yield 1.5
     region = next(r for r in area.regions if r.type == "WINDOW")
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.file.execute("INVOKE_DEFAULT")
     yield 2.0
     scene = bpy.context.scene
-    camera = press.addon_module("solve.cameras").find(scene, there, "CAMERA")
-    told["located"] = press.addon_module("shot.selection").shot_folder(scene) == there and camera == scene.camera
+    camera = press.addon_module("solve.cameras").find(scene, destination, "CAMERA")
+    results["located"] = (
+        press.addon_module("shot.selection").shot_folder(scene) == destination and camera == scene.camera
+    )
     yield from press._shoot(work, "11-located")
 
 
@@ -307,9 +311,9 @@ def _scroll_up() -> Iterator[float]:
     yield 0.5
 
 
-def _until(there: Callable[[], Any], seconds: float, what: str) -> Iterator[float]:
+def _until(condition: Callable[[], Any], seconds: float, what: str) -> Iterator[float]:
     until = time.monotonic() + seconds
-    while not there():
+    while not condition():
         if time.monotonic() > until:
             raise RuntimeError(f"waited {seconds:.0f} s for {what}")
         yield 0.2

@@ -54,8 +54,8 @@ def main() -> int:
         with press.screen(args.display):
             blender = subprocess.Popen([*press.command(args.blender, __file__), "--factory-startup"], env=environ)
             press._serve(blender, Path(name), output, environ, args.limit)
-        told = Path(name) / "told.json"
-        results = json.loads(told.read_text()) if told.is_file() else {"error": "Blender told nothing"}
+        results_file = Path(name) / "told.json"
+        results = json.loads(results_file.read_text()) if results_file.is_file() else {"error": "Blender told nothing"}
         print(json.dumps(results, indent=1))
         good = results.get("button_when_paused") == "Resume" and results.get("iterations_when_paused") == 150
         good = good and results.get("iterations") == 150 + MORE and results.get("previews_seen", 0) >= 3
@@ -67,11 +67,11 @@ def inside() -> None:
     sys.path.insert(0, str(ROOT / "splannequin_addon"))
     package = importlib.import_module("run_in_bpy").load_package()
     package.register()
-    told: dict[str, Any] = {}
-    press.act(_play(package.__name__, told), Path(os.environ[PLAN]), told)
+    results: dict[str, Any] = {}
+    press.act(_play(package.__name__, results), Path(os.environ[PLAN]), results)
 
 
-def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
+def _play(package: str, results: dict[str, Any]) -> Iterator[float]:
     """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
@@ -95,22 +95,22 @@ def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
         if path in (pictures._collection or {}):  # the preview is drawn, not only listed
             shown[path] = pictures.icon_of(Path(path))
         yield 0.1
-    told["previews_seen"] = len(set(shown.values()))
+    results["previews_seen"] = len(set(shown.values()))
     yield from press._shoot(work, "10-train-on-running", settle=2)
     yield from press._click("splannequin.cancel")
     while watch.running() is not None:
         yield 0.2
     yield 1.5
     plan = module("train.training").plan(watch.state, props.run_name, props.preset)
-    told["button_when_paused"] = plan.button
-    told["iterations_when_paused"] = watch.state.runs["main"]["iterations"]
+    results["button_when_paused"] = plan.button
+    results["iterations_when_paused"] = watch.state.runs["main"]["iterations"]
     yield from press._shoot(work, "10-paused")
     yield from press._click("splannequin.train")
     yield 1.0
     while watch.running() is not None:
         yield 0.2
     yield 1.5
-    told["iterations"] = watch.state.runs["main"]["iterations"]
+    results["iterations"] = watch.state.runs["main"]["iterations"]
     yield from press._shoot(work, "10-train-on-done")
 
 

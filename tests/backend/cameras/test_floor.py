@@ -44,7 +44,7 @@ def test_the_floor_is_found_under_a_table_among_outliers(seed):
     assert np.array_equal(again[0], normal) and again[1] == height, "the same points, the same floor"
 
 
-def test_no_floor_is_made_up():
+def test_no_floor_is_invented():
     points, centres, ups = room(0)
     assert find_floor(points[:49], centres, ups) is None
     rng = np.random.default_rng(1)

@@ -65,7 +65,7 @@ def test_transforms_come_out_with_opencv_axes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("told", "model", "bend"),
+    ("fields", "model", "bend"),
     [
         ({"k1": 0.1, "k2": -0.02, "p1": 0.001, "p2": 0.002}, "OPENCV", (0.1, -0.02, 0.001, 0.002)),
         ({"k1": 0.1, "k3": 0.03}, "FULL_OPENCV", (0.1, 0.0, 0.0, 0.0, 0.03, 0.0, 0.0, 0.0)),
@@ -73,12 +73,12 @@ def test_transforms_come_out_with_opencv_axes(tmp_path):
         ({"camera_model": "PINHOLE"}, "PINHOLE", ()),
     ],
 )
-def test_the_lens_of_transforms(tmp_path, told, model, bend):
-    lens = imported.read(transforms(tmp_path / "t.json", some_poses(), **PLAIN, **told)).lenses[0]
+def test_the_lens_of_transforms(tmp_path, fields, model, bend):
+    lens = imported.read(transforms(tmp_path / "t.json", some_poses(), **PLAIN, **fields)).lenses[0]
     assert (lens.model, lens.params[4:]) == (model, bend)
 
 
-def test_a_lens_can_stand_in_each_frame_and_as_an_angle(tmp_path):
+def test_lens_can_be_given_per_frame_or_as_an_angle(tmp_path):
     file = transforms(tmp_path / "t.json", some_poses(3), w=200, h=100, camera_angle_x=math.pi / 2)
     data = json.loads(file.read_text())
     data["frames"][1] |= {"fl_x": 90.0, "cx": 99.0}
@@ -142,8 +142,8 @@ def test_a_model_written_is_the_model_read(solved, tmp_path, text):
     again = read_model(tmp_path / "again")
     assert again.cameras == model.cameras
     assert [(i.number, i.name, i.camera) for i in again.images] == [(i.number, i.name, i.camera) for i in model.images]
-    for one, other in zip(model.images, again.images, strict=True):
-        np.testing.assert_allclose(one.pose, other.pose, atol=1e-14)
+    for one, second in zip(model.images, again.images, strict=True):
+        np.testing.assert_allclose(one.pose, second.pose, atol=1e-14)
     np.testing.assert_array_equal(again.points.xyz, model.points.xyz)
     np.testing.assert_array_equal(again.points.rgb, model.points.rgb)
     np.testing.assert_array_equal(again.points.error, model.points.error)
@@ -160,8 +160,8 @@ def test_broken_files_are_a_sentence(solved, tmp_path):
     files = {p.name: p.read_bytes() for p in (solved.shot.solve / "colmap").glob("*.bin")}
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         for cut in (0, 5, len(files[name]) // 2):
-            for other, data in files.items():
-                (tmp_path / other).write_bytes(data[:cut] if other == name else data)
+            for file_name, data in files.items():
+                (tmp_path / file_name).write_bytes(data[:cut] if file_name == name else data)
             with pytest.raises(JobError, match=f"These cameras cannot be used: .*{name}"):
                 imported.read(tmp_path)
 
@@ -183,13 +183,13 @@ def test_unusable_transforms_are_a_sentence(tmp_path, change, words):
     file = transforms(tmp_path / "t.json", some_poses())
     data = {k: v for k, v in {**json.loads(file.read_text()), **change}.items() if v is not None}
     file.write_text(json.dumps(data))
-    with pytest.raises(JobError, match=words) as told:
+    with pytest.raises(JobError, match=words) as error:
         imported.read(file)
-    assert told.value.exit_code == ExitCode.SOLVE
+    assert error.value.exit_code == ExitCode.SOLVE
 
 
 @pytest.mark.parametrize("make", [lambda p: p / "gone", lambda p: p])
-def test_nothing_there_is_a_sentence(tmp_path, make):
+def test_missing_cameras_give_a_readable_error(tmp_path, make):
     with pytest.raises(JobError, match="does not exist|contains no cameras"):
         imported.read(make(tmp_path))
 
@@ -239,7 +239,7 @@ def test_matching_is_by_number_and_says_what_is_missing():
 
 
 @pytest.mark.parametrize("lost", [[], [19], [3, 4, 11], [0]])
-def test_pictures_counted_from_zero_are_no_frame_late_however_many_have_a_camera(lost):
+def test_zero_based_pictures_are_not_shifted_by_a_frame(lost):
     """In the last case the first picture has no camera, so it looks like a count from 1."""
     solve = fake_solve(20, first=0)
     solve.cameras = [c for n, c in enumerate(solve.cameras) if n not in lost]
@@ -287,9 +287,9 @@ def test_points_without_tracks_count_the_pictures_they_lie_in():
     assert points["depth"].tolist() == [4.0, -np.inf, 3.0]
     assert points["error"].tolist() == [2.0, 4.0, 0.0]
     solve.points["seen"] = [np.array([0, 2]), np.array([1]), np.zeros(0, np.int64)]
-    told = imported.stored_points(solve, matched, (200, 200))
-    assert told is not None and told["track"].tolist() == [2, 1, 0]
-    assert float(told["angle"]) == pytest.approx(math.degrees(math.atan(0.75)))
+    known_points = imported.stored_points(solve, matched, (200, 200))
+    assert known_points is not None and known_points["track"].tolist() == [2, 1, 0]
+    assert float(known_points["angle"]) == pytest.approx(math.degrees(math.atan(0.75)))
     assert imported.stored_points(fake_solve(3), matched, (200, 200)) is None
 
 

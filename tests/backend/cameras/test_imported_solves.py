@@ -35,7 +35,7 @@ def the_lens(scale=1):
     }  # fmt: skip
 
 
-def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
+def test_true_cameras_give_a_solve_in_their_world_space(solved, tools, tmp_path):
     """The room's true cameras at twice the picture size, without points: poses are exact, points lie on the walls."""
     shot = again(solved, tools, tmp_path)
     report = tools.recorder()
@@ -54,9 +54,9 @@ def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
     assert len(xyz) > 300 and np.median(np.minimum(walls, block)) < 0.02
     # The undistorted frame equals the pinhole camera's picture.
     ideal = tools.room().render(poses[7], path.frames[7].K).astype(float)
-    off = tools.room().render(poses[7], np.add(path.frames[7].K, (0, 0, 0.5, 0))).astype(float)
+    shifted = tools.room().render(poses[7], np.add(path.frames[7].K, (0, 0, 0.5, 0))).astype(float)
     got = read_png(shot.frames / "000108.png").astype(float)
-    assert np.sqrt(((got - ideal) ** 2).mean()) < 0.5 * np.sqrt(((off - ideal) ** 2).mean()) + 2.0
+    assert np.sqrt(((got - ideal) ** 2).mean()) < 0.5 * np.sqrt(((shifted - ideal) ** 2).mean()) + 2.0
     record = read_json(shot.solve / "solve.json")
     assert (record["camera_model"], record["focal_px"], record["cameras_from"]) == ("OPENCV", 300.0, "transforms.json")
     assert record["world"] == "scene" and read_json(solved.shot.solve / "solve.json")["world"] == ""
@@ -68,20 +68,20 @@ def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
     assert (shot.solve / "solve.json").stat().st_mtime_ns == before, "taken in once"
 
 
-def test_a_colmap_folder_brings_its_own_points(solved, tools, tmp_path):
+def test_colmap_folder_imports_its_points(solved, tools, tmp_path):
     shot = again(solved, tools, tmp_path, step=2)
     report = tools.recorder()
     result = solve_shot(shot, SolveConfig(), report, str(solved.shot.solve / "colmap"))
     assert "features" not in {stage.removeprefix("solve: ") for stage, _, _ in report.steps}
     was, now = (CameraPath.load(s.solve / "cameras.json").frames for s in (solved.shot, shot))
-    for one, other in zip(was[::2], now[::2], strict=True):
-        np.testing.assert_allclose(other.viewmat, one.viewmat, atol=1e-9)
-        np.testing.assert_allclose(other.K, one.K, rtol=1e-6)
+    for one, second in zip(was[::2], now[::2], strict=True):
+        np.testing.assert_allclose(second.viewmat, one.viewmat, atol=1e-9)
+        np.testing.assert_allclose(second.K, one.K, rtol=1e-6)
     assert [f.source for f in now[1::2]] == ["interpolated"] * 10
-    one, other = load_points(solved.shot), load_points(shot)
-    np.testing.assert_allclose(other["xyz"], one["xyz"])
+    one, second = load_points(solved.shot), load_points(shot)
+    np.testing.assert_allclose(second["xyz"], one["xyz"])
     # COLMAP may count an image twice if the image observes a point twice.
-    assert (other["track"] <= one["track"]).all() and (other["track"] == one["track"]).mean() > 0.9
+    assert (second["track"] <= one["track"]).all() and (second["track"] == one["track"]).mean() > 0.9
     assert result["registered"] == 11 and result["quality"].startswith("Good: cameras imported for 11 of 11 frames")
     difference = read_png(shot.frames / "000105.png").astype(int) - read_png(solved.shot.frames / "000105.png")
     assert np.abs(difference).max() <= 1
@@ -104,8 +104,8 @@ def test_two_lenses_in_one_clip(solved, tools, tmp_path):
     assert lenses[110].lens.params[4] != lenses[111].lens.params[4]
     for frame in (105, 115):
         undistort = Undistorter(lenses[frame].where(320, 240))
-        off = undistort(read_png(shot.frames / f"raw/{frame:06d}.png")).astype(int)
-        assert np.abs(off - read_png(shot.frames / f"{frame:06d}.png")).max() <= 1
+        difference = undistort(read_png(shot.frames / f"raw/{frame:06d}.png")).astype(int)
+        assert np.abs(difference - read_png(shot.frames / f"{frame:06d}.png")).max() <= 1
 
 
 def test_cameras_of_another_clip_are_refused(solved, tools, tmp_path):
@@ -130,10 +130,10 @@ def test_what_goes_out_comes_back_in(solved, tools, tmp_path, kind, text):
     assert all(file.is_file() for file in written)
     report = tools.recorder()
     result = solve_shot(shot, SolveConfig(features=1000), report, str(tmp_path / "out" / "é"))
-    one, other = (CameraPath.load(s.solve / "cameras.json") for s in (solved.shot, shot))
-    assert [f.frame for f in other.frames] == [f.frame for f in one.frames]
-    np.testing.assert_allclose([f.viewmat for f in other.frames], [f.viewmat for f in one.frames], atol=1e-6)
-    np.testing.assert_allclose([f.K for f in other.frames], [f.K for f in one.frames], atol=1e-6)
+    one, second = (CameraPath.load(s.solve / "cameras.json") for s in (solved.shot, shot))
+    assert [f.frame for f in second.frames] == [f.frame for f in one.frames]
+    np.testing.assert_allclose([f.viewmat for f in second.frames], [f.viewmat for f in one.frames], atol=1e-6)
+    np.testing.assert_allclose([f.K for f in second.frames], [f.K for f in one.frames], atol=1e-6)
     assert result["registered"] == 11 and report.warnings == []
     assert (read_png(shot.frames / "000110.png") == read_png(solved.shot.frames / "000110.png")).all()
     if kind == "colmap":
@@ -179,7 +179,7 @@ def test_an_export_never_hides_behind_another_model(solved, tmp_path):
         export_cameras(Shot.create(tmp_path / "new.splannequin"), "colmap", tmp_path / "out")
 
 
-def test_cameras_that_stand_still_are_refused(solved, tools, tmp_path):
+def test_static_cameras_are_refused(solved, tools, tmp_path):
     """No point can be triangulated."""
     shot = again(solved, tools, tmp_path)
     file = transforms(tmp_path / "transforms.json", [np.eye(4)] * 21, **the_lens())
@@ -202,7 +202,7 @@ def test_how_much_agrees_decides():
         refuse_misfit({**answer, "triangulation_angle_deg": 1.0}, 500)
 
 
-def test_refused_cameras_leave_the_solve_that_is_there(solved, tools, tmp_path):
+def test_refused_cameras_keep_the_existing_solve(solved, tools, tmp_path):
     before = (solved.shot.solve / "cameras.json").read_bytes()
     file = transforms(tmp_path / "t.json", some_poses(10), [f"{n}.png" for n in range(10)], **the_lens())
     with pytest.raises(JobError, match="Only 5 of the 11 frames"):

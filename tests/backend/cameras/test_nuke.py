@@ -100,7 +100,7 @@ def test_a_nuke_script_sees_what_the_solve_saw(shifted):
         np.testing.assert_allclose(np.stack([x, y], 1)[before], pixels[before], rtol=1e-4, atol=2e-3)
 
 
-def test_the_axis_of_a_script_stands_splats_into_nukes_world():
+def test_script_axis_places_splats_in_nuke_space():
     """Exported splats have z up, as in Blender. The Axis node rotates them into the world of the Nuke camera."""
     text = nk_text(turning(False), SCENE, "a").partition("Axis2")[2]
     degrees = [float(v) for v in re.search(r"rotate \{(.*)\}", text)[1].split()]

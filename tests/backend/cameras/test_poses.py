@@ -71,13 +71,13 @@ def test_half_way_has_half_the_turn_and_the_middle_of_the_centres():
 
 
 @given(vectors, vectors, vectors, vectors)
-def test_the_ends_are_the_given_poses(ra, ca, rb, cb):
+def test_first_and_last_poses_are_kept(ra, ca, rb, cb):
     a, b = pose(ra, ca), pose(rb, cb)
     assert np.allclose(interpolate_pose(a, b, 0.0), a, atol=1e-9)
     assert np.allclose(interpolate_pose(a, b, 1.0), b, atol=1e-9)
 
 
-def test_gaps_are_filled_by_time_and_ends_held():
+def test_gaps_are_interpolated_by_time_and_ends_are_constant():
     known = {1: pose([0, 0, 0], [0, 0, 0]), 4: pose([0, 0.9, 0], [9, 0, 0])}
     seconds = np.array([0.0, 1.0, 1.1, 3.0, 4.0, 5.0])
     filled = fill_poses(seconds, known)

@@ -120,7 +120,7 @@ def test_solving_again_mends_what_was_damaged(again, tools):
         assert (read_png(plate) == good).all() and len(load_points(shot)["xyz"]) > 300
 
 
-def test_a_frame_that_was_damaged_since_the_import_is_told_before_the_solve_and_imported_again(solved, again, tools):
+def test_damaged_frame_is_detected_before_the_solve_and_reimported(solved, again, tools):
     shot, _ = again
     cut(shot.frames / "raw/000107.png")
     (shot.frames / "raw/000109.png").unlink()

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[2]
+FOLDER = Path(__file__).resolve().parent
+ROOT = FOLDER.parents[2]
 
 
 @pytest.fixture(scope="session")
@@ -27,7 +27,7 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if torch.version.cuda is not None or torch.version.hip is not None:
         pytest.skip("the pretended card needs a PyTorch without CUDA: this one would ask a driver")
     folder, home = tmp_path_factory.mktemp("card"), Path(torch.__path__[0])
-    command = [compiler, "-shared", "-fPIC", "-O0", "-w", "-std=c++20", str(HERE / "guard.cpp"), "-o", "guard.so"]
+    command = [compiler, "-shared", "-fPIC", "-O0", "-w", "-std=c++20", str(FOLDER / "guard.cpp"), "-o", "guard.so"]
     command += [f"-D_GLIBCXX_USE_CXX11_ABI={int(torch.compiled_with_cxx11_abi())}", f"-I{home / 'include'}"]
     command += [f"-L{home / 'lib'}", "-ltorch_cpu", "-lc10", f"-Wl,-rpath,{home / 'lib'}"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
@@ -56,13 +56,13 @@ WALKS = (
 def walk(card: Path) -> Callable[[str], Any]:
     """walk(words): result of a walk of `walks.py`; the words are one of `WALKS` or its beginning."""
     environ = {**os.environ, "PRETEND_CARD": str(card), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-P", str(HERE / "walks.py"), *WALKS]
+    command = [sys.executable, "-P", str(FOLDER / "walks.py"), *WALKS]
     done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    told = json.loads(done.stdout.splitlines()[-1])
+    results = json.loads(done.stdout.splitlines()[-1])
 
     def of(words: str) -> Any:
-        (found,) = (told[name] for name in WALKS if f"{name} ".startswith(f"{words} "))
+        (found,) = (results[name] for name in WALKS if f"{name} ".startswith(f"{words} "))
         assert "broke" not in found, found["broke"]
         return found
 

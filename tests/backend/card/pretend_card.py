@@ -26,7 +26,7 @@ from torch.utils._pytree import tree_flatten, tree_map  # noqa: E402
 CUDA = torch.device("cuda:0")
 _BLOCK = 512
 """Granularity of torch's allocator in bytes."""
-_ASKED = {
+_SYNCHRONISING = {
     "_local_scalar_dense", "nonzero", "masked_select", "unique_dim", "_unique2", "unique_consecutive", "equal",
     "repeat_interleave",
 }  # fmt: skip
@@ -59,7 +59,7 @@ class Card:
         """Memory of the device in bytes."""
         self.live = self.peak = 0
         """Bytes in use now, and their maximum."""
-        self._held: dict[int, list[int]] = {}
+        self._references: dict[int, list[int]] = {}
         self.tape: Tape | None = None
         """Active recording, or None."""
         self.before_launch: Callable[[str], None] = lambda name: None
@@ -73,23 +73,23 @@ class Card:
         key = storage.data_ptr()
         if not key:
             return 0
-        if key not in self._held:
+        if key not in self._references:
             size = -(-storage.nbytes() // _BLOCK) * _BLOCK
             if self.live + size > self.limit:
                 raise torch.OutOfMemoryError(f"CUDA out of memory. Tried to allocate {size} bytes at {_place()}.")
-            self._held[key] = [0, size]
+            self._references[key] = [0, size]
             self.live += size
             self.peak = max(self.peak, self.live)
-        self._held[key][0] += 1
+        self._references[key][0] += 1
         return key
 
     def drop(self, key: int) -> None:
-        held = self._held.get(key)
-        if held is None:
+        entry = self._references.get(key)
+        if entry is None:
             return
-        held[0] -= 1
-        if not held[0]:
-            self.live -= self._held.pop(key)[1]
+        entry[0] -= 1
+        if not entry[0]:
+            self.live -= self._references.pop(key)[1]
 
 
 class Tape:
@@ -140,16 +140,16 @@ class Tape:
 
             def again() -> None:
                 new = func(*real[0], **real[1])
-                for there, value in zip(tree_flatten(out)[0], tree_flatten(new)[0], strict=True):
-                    there.copy_(value)
+                for target, value in zip(tree_flatten(out)[0], tree_flatten(new)[0], strict=True):
+                    target.copy_(value)
 
             self.steps.append(again)
         return out
 
     def launch(self, inputs: list[Any], run: Callable[[list[Any]], None]) -> None:
         """Record a launch. Structures are copied, because the host goes on to write into them."""
-        held = [type(i).from_buffer_copy(i) if isinstance(i, ctypes.Structure) else i for i in inputs]
-        self.steps.append(lambda: run(held))
+        copied = [type(i).from_buffer_copy(i) if isinstance(i, ctypes.Structure) else i for i in inputs]
+        self.steps.append(lambda: run(copied))
 
 
 CARD = Card()
@@ -166,26 +166,26 @@ def _place() -> str:
     return " < ".join(found)
 
 
-def _given_back(held: list[int]) -> None:
-    CARD.drop(held[0])
+def _release(storage_key: list[int]) -> None:
+    CARD.drop(storage_key[0])
 
 
 class Pretended(torch.Tensor):
     """A tensor that reports to be on the simulated device."""
 
     _real: torch.Tensor
-    _held: list[int]
+    _storage_key: list[int]
     """Result of `CARD.take` for the storage."""
 
     @staticmethod
     def __new__(cls, real: torch.Tensor) -> Pretended:
-        made = torch.Tensor._make_wrapper_subclass(
+        tensor = torch.Tensor._make_wrapper_subclass(
             cls, real.shape, strides=real.stride(), storage_offset=real.storage_offset(), dtype=real.dtype,
             layout=real.layout, device=CUDA, requires_grad=False,
         )  # fmt: skip
-        made._real, made._held = real, [CARD.take(real.untyped_storage())]
-        weakref.finalize(made, _given_back, made._held)
-        return made
+        tensor._real, tensor._storage_key = real, [CARD.take(real.untyped_storage())]
+        weakref.finalize(tensor, _release, tensor._storage_key)
+        return tensor
 
     __torch_function__ = torch._C._disabled_torch_function_impl
 
@@ -208,12 +208,12 @@ class Pretended(torch.Tensor):
         return self.detach()
 
     @data.setter
-    def data(self, other: Any) -> None:
-        if not isinstance(other, Pretended) or other.shape != self.shape:
+    def data(self, value: Any) -> None:
+        if not isinstance(value, Pretended) or value.shape != self.shape:
             raise Mismatch("data of another device or shape")
-        key = CARD.take(other._real.untyped_storage())
-        CARD.drop(self._held[0])
-        self._real, self._held[0] = other._real, key
+        key = CARD.take(value._real.untyped_storage())
+        CARD.drop(self._storage_key[0])
+        self._real, self._storage_key[0] = value._real, key
 
 
 def _real(value: Any) -> Any:
@@ -227,12 +227,12 @@ def _on_card(value: Any) -> Any:
 def _check(func: Any, name: str, tensors: list[Any]) -> None:
     """Raise Mismatch where torch refuses tensors of two devices."""
     ours = [t for t in tensors if isinstance(t, Pretended)]
-    others = [t for t in tensors if not isinstance(t, Pretended)]
-    if not ours or not others or name in _COPIES or name in _INDEXED:
+    host_tensors = [t for t in tensors if not isinstance(t, Pretended)]
+    if not ours or not host_tensors or name in _COPIES or name in _INDEXED:
         return
     lenient = torch.Tag.pointwise in func.tags or name in _LENIENT
     written = name.endswith("_") and not isinstance(tensors[0], Pretended)
-    if written or not lenient or any(t.dim() > 0 for t in others):
+    if written or not lenient or any(t.dim() > 0 for t in host_tensors):
         shapes = [(tuple(t.shape), "cuda" if isinstance(t, Pretended) else "cpu") for t in tensors]
         raise Mismatch(f"{func} of {shapes} at {_place()}")
 
@@ -247,8 +247,8 @@ def _check_index(func: Any, name: str, args: Any) -> None:
             CARD.waited("index from the host")
         if index.dtype in (torch.bool, torch.uint8):
             CARD.waited("flags as an index")
-    apart = "put" in name and isinstance(values, Pretended) != isinstance(args[2], Pretended)
-    if apart and (not isinstance(values, Pretended) or args[2].dim() > 0):
+    is_mixed = "put" in name and isinstance(values, Pretended) != isinstance(args[2], Pretended)
+    if is_mixed and (not isinstance(values, Pretended) or args[2].dim() > 0):
         raise Mismatch(f"{func}: values of another device at {_place()}")
 
 
@@ -262,7 +262,7 @@ def _count_waits(name: str, args: Any, kwargs: dict[str, Any], to_card: bool, to
         leaves = from_card and kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "cpu"
         if leaves or (not from_card and to_card and not kwargs.get("non_blocking", False)):
             CARD.waited("to cpu" if leaves else "to cuda")
-    elif name in _ASKED and touches:
+    elif name in _SYNCHRONISING and touches:
         CARD.waited(name)
 
 
@@ -279,14 +279,14 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         _check_index(func, name, args)
     _count_waits(name, args, kwargs, to_card, touches)
     CARD.operators += (touches or to_card) and not func.is_view and name not in _NOTHING
-    held = {**kwargs, "device": torch.device("cpu")} if to_card else dict(kwargs)
-    held.pop("pin_memory", None)
+    host_kwargs = {**kwargs, "device": torch.device("cpu")} if to_card else dict(kwargs)
+    host_kwargs.pop("pin_memory", None)
     if name == "_to_copy":
-        held.pop("device", None)  # between two host tensors the result is always a copy
-    real = tree_map(_real, args), tree_map(_real, held)
+        host_kwargs.pop("device", None)  # between two host tensors the result is always a copy
+    real = tree_map(_real, args), tree_map(_real, host_kwargs)
     if CARD.tape is not None and (touches or to_card):
         leaves = name == "_to_copy" and (to_host or not touches)
-        if leaves or name in _ASKED:
+        if leaves or name in _SYNCHRONISING:
             raise RuntimeError(f"operation not permitted when stream is capturing: {func} at {_place()}")
         out = CARD.tape.run(func, name, args, kwargs, real)
     else:
@@ -326,14 +326,14 @@ def pretended_card() -> Iterator[Card]:
         saved.append((where, name, getattr(where, name)))
         setattr(where, name, value)
 
-    host, launch_here = torch.device("cpu"), native.launch_on
+    host, real_launch = torch.device("cpu"), native.launch_on
 
     def launch_on(kernel: Any, dim: int, inputs: list[Any], device: torch.device) -> None:
         CARD.launched[kernel.key] += device.type == "cuda"
         if CARD.tape is not None:
-            CARD.tape.launch(inputs, lambda held: launch_here(kernel, dim, held, host))
+            CARD.tape.launch(inputs, lambda copied: real_launch(kernel, dim, copied, host))
         else:
-            launch_here(kernel, dim, inputs, host)
+            real_launch(kernel, dim, inputs, host)
 
     def launch(self: Any, name: str, args: Any, threads: int, channels: int = 0) -> None:
         if threads:
@@ -343,7 +343,7 @@ def pretended_card() -> Iterator[Card]:
 
             def go(inputs: list[Any]) -> None:
                 with cuda._Fibers(self.wp):
-                    launch_here(cuda.build(name, channels), dim, inputs, host, cuda.source.BLOCK)
+                    real_launch(cuda.build(name, channels), dim, inputs, host, cuda.source.BLOCK)
 
             if CARD.tape is not None:
                 CARD.tape.launch([args], go)

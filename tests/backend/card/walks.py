@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parents[2])]
+FOLDER = Path(__file__).resolve().parent
+sys.path[:0] = [str(FOLDER), str(FOLDER.parents[2])]
 
 from pretend_card import CARD, pretended_card  # noqa: E402  (before torch)
 
 
 def small_world(folder: Path) -> tuple[Any, type]:
     """(the tiny shot at 32 x 24, the class of its silent reporter)."""
-    spec = importlib.util.spec_from_file_location("tiny", HERE.parent / "conftest.py")
+    spec = importlib.util.spec_from_file_location("tiny", FOLDER.parent / "conftest.py")
     assert spec is not None and spec.loader is not None
     tiny = importlib.util.module_from_spec(spec)
     sys.modules["tiny"] = tiny
@@ -41,8 +41,8 @@ def new_trainer(world: Any, quiet: type, method: str, supervision: str, poses: b
     from torch_backend.train.trainer import Trainer
 
     scene = load_scene(world.shot)
-    asked = TrainParams(iterations=iterations, max_gaussians=330, method=method, supervision=supervision)
-    config = config_from_params(asked)
+    train_params = TrainParams(iterations=iterations, max_gaussians=330, method=method, supervision=supervision)
+    config = config_from_params(train_params)
     config.poses.on, config.densify.every, config.init.seeds = poses, 5, 0
     config.gate.start, config.field.start, config.supervision.support_samples = 0.2, 0.2, 64
     config.densify.start = min(config.densify.start, 0.2)
@@ -73,7 +73,7 @@ def _steps(trainer: Any, count: int) -> dict[str, int]:
 def steps(folder: Path, *runs: str) -> dict[str, Any]:
     """Per run (`METHOD/SUPERVISION[/poses]`): synchronisations in steps, and the state at the end."""
     world, quiet = small_world(folder)
-    told: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for run in runs:
         method, supervision, *poses = run.split("/")
         with pretended_card():
@@ -82,14 +82,14 @@ def steps(folder: Path, *runs: str) -> dict[str, Any]:
             moving = len(trainer.model.open_rows())
             waits |= _steps(trainer, 8)
             means = trainer.model.gaussians.params["means"]
-            told[run] = {"waits": waits, "moving": moving, "finite": bool(means.isfinite().all())}
-    return told
+            results[run] = {"waits": waits, "moving": moving, "finite": bool(means.isfinite().all())}
+    return results
 
 
 def recorded(folder: Path, *methods: str) -> dict[str, Any]:
     """Per method: compare a run with recorded steps and one with launched steps, through all events of a run."""
     world, quiet = small_world(folder)
-    told: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for method in methods:
         found: list[Any] = []
         for records in (False, True):
@@ -105,15 +105,15 @@ def recorded(folder: Path, *methods: str) -> dict[str, Any]:
                 found.append(values)
                 moving = len(trainer.model.open_rows())
         plain, replayed = found
-        off = {
+        error = {
             name: float((replayed[name] - value).norm() / value.norm().clamp_min(1e-9)) for name, value in plain.items()
         }
-        worst = max(off, key=lambda name: off[name])
-        told[method] = {
-            "replayed": recorder.replayed, "refused": recorder.refused, "off": off[worst], "worst": worst,
+        worst = max(error, key=lambda name: error[name])
+        results[method] = {
+            "replayed": recorder.replayed, "refused": recorder.refused, "off": error[worst], "worst": worst,
             "moving": moving,
         }  # fmt: skip
-    return told
+    return results
 
 
 def launches(folder: Path, *methods: str) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def launches(folder: Path, *methods: str) -> dict[str, Any]:
     from torch_backend.deformation import planes_cuda
 
     world, quiet = small_world(folder)
-    told: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for method in methods:
         counts: dict[str, list[int]] = {}
         for name, refused in (("ours", ""), ("torch", "it is wrong")):
@@ -140,8 +140,8 @@ def launches(folder: Path, *methods: str) -> dict[str, Any]:
                         counts.setdefault(name, []).append(CARD.operators + sum(CARD.launched.values()) - before)
             finally:
                 planes_cuda.refused = ""
-        told[method] = counts
-    return told
+        results[method] = counts
+    return results
 
 
 def resume(folder: Path, method: str) -> dict[str, Any]:
@@ -153,13 +153,13 @@ def resume(folder: Path, method: str) -> dict[str, Any]:
         trainer = new_trainer(world, quiet, method, "support", False)
         _steps(trainer, 5)
         save_run(trainer, folder / "x.safetensors")
-        other = new_trainer(world, quiet, method, "support", False)
-        restore_run(other, folder / "x.safetensors")
-        before = len(other.model.gaussians)
-        _steps(other, 1)
-        moments = other.optimizer.state[other.model.gaussians.params["means"]]
+        resumed = new_trainer(world, quiet, method, "support", False)
+        restore_run(resumed, folder / "x.safetensors")
+        before = len(resumed.model.gaussians)
+        _steps(resumed, 1)
+        moments = resumed.optimizer.state[resumed.model.gaussians.params["means"]]
         return {
-            "iteration": other.iteration, "before": before, "after": len(other.model.gaussians),
+            "iteration": resumed.iteration, "before": before, "after": len(resumed.model.gaussians),
             "devices": sorted({value.device.type for value in moments.values()}),
         }  # fmt: skip
 
@@ -177,8 +177,8 @@ def station(folder: Path) -> dict[str, Any]:
         params = TrainParams(run="g", iterations=10, max_gaussians=260, device="cuda", holdout=0)
         trained = train_shot(world.shot, params, report)
         extended = train_shot(world.shot, TrainParams(run="g", device="cuda", extend=2), report)
-        asked = FreezeParams(run="g", take="t", first=101, last=101, device="cuda", develop="off")
-        frozen = freeze_shot(world.shot, asked, report)
+        train_params = FreezeParams(run="g", take="t", first=101, last=101, device="cuda", develop="off")
+        frozen = freeze_shot(world.shot, train_params, report)
         live = LiveSession(world.shot, "g", "cuda")
         view = LiveView(
             view=0, seq=1, t_star=105, viewmat=world.viewmats[3].flatten().tolist(), K=[60.0, 60.0, 32.0, 24.0],
@@ -199,7 +199,7 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
     from torch_backend.train.events import schedule_events
 
     world, quiet = small_world(folder)
-    told: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for method in methods:
         with pretended_card():
             trainer = new_trainer(world, quiet, method, "support", False)
@@ -223,8 +223,8 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
             # Absent in so short a run: the running mean of the last steps, a second list of hits, and harmonics.
             absent = 4 * (11 + harmonics) + 16 * memory.HIT_BYTES + 8 * harmonics
             said = memory.gaussian_bytes(trainer.config, len(trainer.centres)) + whole - absent
-            told[method] = {"measured": (high - low) / (many - few), "said": said}
-    return told
+            results[method] = {"measured": (high - low) / (many - few), "said": said}
+    return results
 
 
 def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
@@ -304,12 +304,12 @@ WALKS = {
 }  # fmt: skip
 
 if __name__ == "__main__":
-    told = {}
+    results = {}
     for walk in sys.argv[1:]:
-        with tempfile.TemporaryDirectory() as made:
+        with tempfile.TemporaryDirectory() as folder:
             CARD.limit = 8 << 30
             try:
-                told[walk] = WALKS[walk.split()[0]](Path(made), *walk.split()[1:])
+                results[walk] = WALKS[walk.split()[0]](Path(folder), *walk.split()[1:])
             except Exception:
-                told[walk] = {"broke": traceback.format_exc()}
-    print(json.dumps(told))
+                results[walk] = {"broke": traceback.format_exc()}
+    print(json.dumps(results))

@@ -30,12 +30,12 @@ def test_facts_are_read_without_what_follows_them(tmp_path):
         struct.pack("<Q", 4) + b"[1]]",
     ],
 )
-def test_a_file_of_others_or_half_a_file_says_nothing(tmp_path, content):
+def test_foreign_or_truncated_file_has_no_header(tmp_path, content):
     file = tmp_path / "checkpoint.safetensors"
     file.write_bytes(content)
     assert checkpoint_facts(file) == {}
 
 
-def test_a_file_that_is_not_there_is_an_error(tmp_path):
+def test_missing_file_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError):
         checkpoint_facts(tmp_path / "checkpoint.safetensors")

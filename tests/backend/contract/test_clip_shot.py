@@ -12,12 +12,12 @@ from torch_backend.contract import (
 from torch_backend.contract.clip_shot import check_same_clip
 
 
-def imported(folder, source, beside=None):
+def imported(folder, source, relative_path=None):
     write_json(folder / "shot.json", {"version": 1, "name": "a", "source": str(source)})
-    write_json(folder / "frames" / "frames.json", {} if beside is None else {"beside": beside})
+    write_json(folder / "frames" / "frames.json", {} if relative_path is None else {"beside": relative_path})
 
 
-def test_clips_of_one_stem_have_shots_of_their_own_whatever_was_imported_before(tmp_path):
+def test_clips_with_one_stem_get_separate_shots(tmp_path):
     clips = [tmp_path / name for name in ("a.mov", "a.mp4", "a.mp4.avi", "a.avi")]
     (tmp_path / "a.mp4.splannequin").mkdir()
     found = {}
@@ -32,7 +32,7 @@ def test_clips_of_one_stem_have_shots_of_their_own_whatever_was_imported_before(
     assert default_shot_folder(clips[0]) not in [tmp_path / "a.splannequin", tmp_path / "a.mov.splannequin"]
 
 
-def test_a_shot_that_was_moved_with_its_clip_is_of_the_clip_and_one_beside_a_namesake_is_not(tmp_path):
+def test_moved_shot_matches_its_clip_but_not_a_namesake(tmp_path):
     shot, clip = tmp_path / "here" / "a.splannequin", tmp_path / "here" / "a.mp4"
     imported(shot, tmp_path / "gone" / "a.mp4")
     clip.touch()

@@ -112,7 +112,7 @@ def test_a_process_is_known_by_its_start_and_command():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
-def test_who_runs_from_a_folder_is_told_by_its_command(tmp_path):
+def test_process_is_identified_by_its_command(tmp_path):
     folder = tmp_path.resolve()
     (folder / "bin").mkdir()
     (folder / "link").symlink_to(folder / "bin")
@@ -136,7 +136,7 @@ print(os.read(0, 3), child.stdout.strip(), os.read(taken, 3))
 """
 
 
-def test_an_input_that_is_ours_alone_is_seen_by_nobody_else():
+def test_private_input_is_not_visible_to_other_processes():
     """On Windows, a child process or a loading library would block while a thread of ours reads the same input."""
     ran = subprocess.run([sys.executable, "-c", READER], input="abc", capture_output=True, text=True, check=True)
     assert ran.stdout.split() == ["b''", "b''", "b'abc'"]
@@ -148,9 +148,9 @@ def test_ps_tells_the_same_as_proc():
     before = time.time()
     child = child_process()
     try:
-        told, known = contract.process_of_ps(child.pid), contract.process(child.pid)
-        assert told is not None and known is not None and told.command == known.command
-        assert before - 5.0 < told.started < time.time() + 5.0
+        by_ps, by_proc = contract.process_of_ps(child.pid), contract.process(child.pid)
+        assert by_ps is not None and by_proc is not None and by_ps.command == by_proc.command
+        assert before - 5.0 < by_ps.started < time.time() + 5.0
     finally:
         child.kill()
         child.communicate()

@@ -56,7 +56,7 @@ def test_endings_of_one_format_make_one_sequence():
         (["a{n}_b{back}.png"], ["a#_b*.png", "a*_b#.png"]),
     ],
 )
-def test_several_sequences_stay_apart(templates, patterns):
+def test_several_sequences_are_kept_separate(templates, patterns):
     found = numbered_files([name for template in templates for name in of(template)])
     assert [s.pattern for s in found] == patterns
     assert all(list(s.files) == list(FRAMES) for s in found)
@@ -67,7 +67,7 @@ def test_cameras_that_took_turns_are_no_one_sequence():
     assert [(s.pattern, len(s.files)) for s in found] == [("cam0_####.png", 8), ("cam1_####.png", 8)]
 
 
-def test_two_names_with_one_number_are_told():
+def test_duplicate_frame_numbers_are_reported():
     assert numbered_files(["f_1.png", "f_2.png", "f_02.png"])[0].twice == ("f_02.png", "f_2.png")
 
 
@@ -95,7 +95,7 @@ def test_what_a_pattern_means(pattern, found):
     assert [s.pattern for s in matching_files(names, pattern)] == found
 
 
-def test_a_pattern_may_hold_what_other_programs_take_for_signs_and_says_which_number_counts():
+def test_pattern_may_contain_special_characters_and_selects_the_number():
     names = of("take#2 [a]{{b}}+(c)_{n}.png")
     assert list(matching_files(names, "take#2 [a]{b}+(c)_####.png")[0].files.values()) == names
     both = of("a{n}_b{back}.png")

@@ -29,11 +29,11 @@ def test_a_change_of_content_tells_where_size_and_time_are_the_same(tmp_path, pl
     keys = []
     for name in ("as filmed", "painted"):
         file = tmp_path / name
-        with open(file, "wb") as made:
-            made.truncate(size)
+        with open(file, "wb") as stream:
+            stream.truncate(size)
             if name == "painted":
-                made.seek(int(place * (size - patch)))
-                made.write(b"x" * patch)
+                stream.seek(int(place * (size - patch)))
+                stream.write(b"x" * patch)
         os.utime(file, (1, 1))
         keys.append(file_digest(file))
     assert keys[0] != keys[1]

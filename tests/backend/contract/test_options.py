@@ -24,27 +24,27 @@ def cases():
     for command, kinds in contract.COMMANDS.items():
         found: dict[tuple[str, ...], list[str]] = {}
         for kind, cls in kinds.items():
-            for one, told in contract.options_for(command, cls):
-                if told.flag.startswith("--"):
-                    found.setdefault(words_for(one, told), []).append(f"{kind}.{one.name}")
+            for one, option in contract.options_for(command, cls):
+                if option.flag.startswith("--"):
+                    found.setdefault(words_for(one, option), []).append(f"{kind}.{one.name}")
         for words, fields in found.items():
             yield pytest.param(command, words, fields, id=f"{command} {words[0]}")
 
 
-def words_for(one, told) -> tuple[str, ...]:
+def words_for(one, option) -> tuple[str, ...]:
     """An option with a value that differs from its default."""
-    if told.switch:
-        return (told.flag,)
-    if told.choices:
-        return told.flag, next(choice for choice in told.choices if choice != one.default)
+    if option.switch:
+        return (option.flag,)
+    if option.choices:
+        return option.flag, next(choice for choice in option.choices if choice != one.default)
     if one.name == "position":
-        return told.flag, "1,2,3"
-    return told.flag, "48" if "str" not in str(one.type) else "word"
+        return option.flag, "1,2,3"
+    return option.flag, "48" if "str" not in str(one.type) else "word"
 
 
 def fields_of(args: argparse.Namespace) -> dict[str, object]:
-    asked = contract.requested_params(args).items()
-    return {f"{kind}.{name}": value for kind, params in asked for name, value in dataclasses.asdict(params).items()}
+    requested = contract.requested_params(args).items()
+    return {f"{kind}.{name}": value for kind, params in requested for name, value in dataclasses.asdict(params).items()}
 
 
 @pytest.mark.parametrize(("command", "words", "fields"), list(cases()))
@@ -57,21 +57,21 @@ def test_every_option_changes_what_it_is_for_and_nothing_else(command, words, fi
         assert isinstance(params, contract.PARAMS[kind])
 
 
-def test_what_is_asked_for_without_an_option_is_each_fields_default_but_for_finished_frames():
+def test_without_options_every_field_has_its_default():
     for command in contract.COMMANDS:
         args = cli.parser().parse_args([command, *NEEDED.get(command, ("s.splannequin",))])
         for params in contract.requested_params(args).values():
             plain = dataclasses.asdict(type(params)())
-            other = {name for name, value in plain.items() if value != getattr(params, name)} - {"source"}
-            assert other == ({"only_missing"} if isinstance(params, contract.FreezeParams) else set())
+            changed = {name for name, value in plain.items() if value != getattr(params, name)} - {"source"}
+            assert changed == ({"only_missing"} if isinstance(params, contract.FreezeParams) else set())
 
 
 def test_every_option_says_what_it_does():
     for cls in contract.PARAMS.values():
-        for one, told in option_table.options_of(cls):
-            assert not told.flag or (told.help and told.help[-1] not in ".:"), one.name
-            assert bool(told.label) == bool(told.tip), one.name
-            assert not told.items or set(told.items) == set(told.choices), one.name
+        for one, option in option_table.options_of(cls):
+            assert not option.flag or (option.help and option.help[-1] not in ".:"), one.name
+            assert bool(option.label) == bool(option.tip), one.name
+            assert not option.items or set(option.items) == set(option.choices), one.name
 
 
 def read_of(files, names: tuple[str, ...]) -> set[str]:
@@ -114,7 +114,7 @@ def test_no_word_of_a_verb_is_passed_over_by_its_side(side, files):
     for name, verb in contract.VERBS.items():
         if side in verb.sides and (side, name) not in ((contract.BLENDER, "farm"), (contract.BLENDER, "export")):
             # Options that are passed on are checked below.
-            dests = {told.dest for _, told in contract.options_for(name, verb.words, side)}
+            dests = {option.dest for _, option in contract.options_for(name, verb.words, side)}
             assert dests - read == set(), name
 
 
@@ -148,7 +148,7 @@ def ask(*words):
     return contract.requested_params(cli.parser().parse_args([str(w) for w in words]))
 
 
-def test_freeze_of_a_shot_asks_for_the_freeze_alone_and_of_a_clip_for_everything(tmp_path):
+def test_freeze_of_a_shot_requests_one_step_and_of_a_clip_all(tmp_path):
     (tmp_path / "renamed").mkdir()
     (tmp_path / "renamed" / "shot.json").touch()
     (tmp_path / "pictures").mkdir()
@@ -184,7 +184,7 @@ def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, in
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "note"),
     [
         (("take", "s.splannequin"), "`take SHOT` is now called `freeze SHOT`"),
         (("train", "s.splannequin", "--host", "mlp", "--method", "static"), "--host is passed over"),
@@ -193,10 +193,10 @@ def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, in
         (("export", "s.splannequin", "--output", "o", "--format", "nerfstudio", "--text"), "--text is passed over"),
     ],
 )
-def test_what_is_said_in_vain_or_in_an_old_word_is_told(words, told, capsys):
+def test_ignored_and_outdated_options_print_a_note(words, note, capsys):
     assert cli.main(list(words)) == contract.ExitCode.USAGE  # this shot does not exist
     first, _, rest = capsys.readouterr().err.partition("\n")
-    assert first.startswith("note: ") and told in first and rest.count("\n") == 1
+    assert first.startswith("note: ") and note in first and rest.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_what_is_heeded_has_no_note(words):
     assert contract.notes(cli.parser().parse_args(list(words))) == []
 
 
-def test_json_may_stand_before_the_verb_and_after_it(tmp_path, capsys):
+def test_json_flag_works_before_and_after_the_verb(tmp_path, capsys):
     assert contract.as_json(cli.parser().parse_args(["--json", "status", "s"]))
     assert contract.as_json(cli.parser().parse_args(["status", "s", "--json"]))
     assert not contract.as_json(cli.parser().parse_args(["status", "s"]))
@@ -229,12 +229,12 @@ def test_limits_are_said_as_they_are():
 def test_masks_are_files_or_words(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
-    def asked(*words: str) -> tuple[str, str]:
+    def masks_of(*words: str) -> tuple[str, str]:
         args = cli.parser().parse_args(["solve", "s.splannequin", *words])
         solve = contract.requested_params(args)["solve"]
         return solve.ignore_mask, solve.people_mask
 
-    assert asked() == ("found", "")
-    assert asked("--ignore-mask", "none", "--people-mask", "none") == ("", "")
-    assert asked("--ignore-mask", "alpha", "--people-mask", "alpha") == ("alpha", "alpha")
-    assert asked("--ignore-mask", "./found", "--people-mask", "found") == (str(tmp_path / "found"),) * 2
+    assert masks_of() == ("found", "")
+    assert masks_of("--ignore-mask", "none", "--people-mask", "none") == ("", "")
+    assert masks_of("--ignore-mask", "alpha", "--people-mask", "alpha") == ("alpha", "alpha")
+    assert masks_of("--ignore-mask", "./found", "--people-mask", "found") == (str(tmp_path / "found"),) * 2

@@ -12,7 +12,7 @@ def rule(source, destination, kind="POSIX"):
 
 
 @pytest.mark.parametrize(
-    ("path", "there"),
+    ("path", "expected"),
     [
         ("/home/ann/clips/a.mp4", "/mnt/clips/a.mp4"),
         ("/home/ann/clips/deep/a.####.exr", "/mnt/deep/a.####.exr"),  # the rule with the longer source wins
@@ -23,14 +23,14 @@ def rule(source, destination, kind="POSIX"):
         ("s:/shots/one/a.mov", "/mnt/shots/one/a.mov"),
     ],
 )
-def test_a_path_of_another_computer_is_found_by_the_rules(path, there):
+def test_a_path_of_another_computer_is_found_by_the_rules(path, expected):
     rules = [
         rule("/home/ann", "/mnt/ann"),
         rule("/home/ann/clips", "/mnt/clips"),
         rule("/home/ann/clips/deep/", "/mnt/deep"),
         rule("S:\\shots", "/mnt/shots", "WINDOWS"),
     ]
-    assert mapped(path, rules) == there
+    assert mapped(path, rules) == expected
 
 
 def test_rules_are_read_from_the_file_that_the_engine_names(tmp_path, monkeypatch):

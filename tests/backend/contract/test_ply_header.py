@@ -19,7 +19,7 @@ def test_the_handle_is_left_at_the_first_vertex():
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "problem"),
     [
         (b"", "not a PLY"),
         (b"ply\nformat ascii 1.0\n", "only binary_little_endian"),
@@ -31,6 +31,6 @@ def test_the_handle_is_left_at_the_first_vertex():
         (b"ply\n" + b"comment a\n" * 2000, "does not end"),
     ],
 )
-def test_what_is_no_header_is_refused(text, told):
-    with pytest.raises(ValueError, match=rf"a\.ply: .*{told}"):
+def test_what_is_no_header_is_refused(text, problem):
+    with pytest.raises(ValueError, match=rf"a\.ply: .*{problem}"):
         read_ply_header(io.BytesIO(text), "a.ply")

@@ -35,7 +35,7 @@ def test_a_verdict_that_cannot_be_shown_is_none(verdict):
     assert verdict_of({"verdict": verdict}) is None and verdict_lines({"verdict": verdict}, {}) == []
 
 
-def test_lines_of_two_verdicts_say_each_thing_once():
+def test_lines_of_two_verdicts_have_no_duplicates():
     run = {"verdict": {"word": "fair", "sentences": ["The left is soft."], "advice": ["Film slower."]}}
     take = {"verdict": {"word": "good", "sentences": ["97 % plate.", "Frame 7 is torn."], "advice": ["Film slower."]}}
     assert verdict_lines(run, {}, take) == [

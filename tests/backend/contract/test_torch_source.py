@@ -26,14 +26,14 @@ def test_torch_comes_with_cuda_where_a_card_can_use_it(monkeypatch, system, driv
 
 
 @pytest.mark.parametrize(("system", "driver"), [("linux", True), ("linux", False), ("win32", False), ("darwin", True)])
-def test_a_card_that_may_take_seconds_to_answer_is_asked_only_where_that_counts(monkeypatch, system, driver):
-    def asked() -> bool:
+def test_slow_gpu_query_runs_only_where_it_matters(monkeypatch, system, driver):
+    def has_card() -> bool:
         raise AssertionError("nobody needs to know")
 
     monkeypatch.delenv(TORCH_INDEX, raising=False)
-    torch_index(system, driver, asked)
+    torch_index(system, driver, has_card)
     monkeypatch.setenv(TORCH_INDEX, "")
-    assert torch_index("win32", True, asked) == ""
+    assert torch_index("win32", True, has_card) == ""
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def test_a_shot_that_was_only_begun_goes(shot):
 
 
 @pytest.mark.parametrize("file", ["frames/raw/000001.png", "notes.txt", "solve/solve.json", "runs/main/config.json"])
-def test_a_shot_with_work_in_it_or_a_file_of_others_stays(shot, file):
+def test_shot_with_work_or_foreign_files_is_kept(shot, file):
     kept = shot.root / file
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.write_text("{}")
@@ -28,7 +28,7 @@ def test_a_shot_with_work_in_it_or_a_file_of_others_stays(shot, file):
     assert kept.is_file()
 
 
-def test_a_folder_that_is_not_there_is_nothing_to_take(tmp_path):
+def test_missing_folder_is_not_removed(tmp_path):
     assert not discard_unborn(tmp_path / "none.splannequin")
 
 
@@ -41,7 +41,7 @@ def test_a_folder_of_somebody_elses_is_not_filled(tmp_path):
 
 
 @pytest.mark.parametrize("left", [[], [".DS_Store"], ["jobs", "frames", ".frames.new"], ["masks", "solve"]])
-def test_a_shot_is_made_where_nothing_of_others_lies(tmp_path, left):
+def test_shot_is_created_only_in_an_empty_place(tmp_path, left):
     for name in left:
         (tmp_path / name).mkdir()
     assert Shot.create(tmp_path).info_path.is_file()

@@ -178,6 +178,6 @@ def test_arap_follows_the_published_schedule():
     assert module.rehearsal == pytest.approx(0.125)
 
 
-def test_no_place_to_stand_is_refused():
+def test_empty_scene_is_refused():
     with pytest.raises(ValueError, match="at least one"):
         ControlPoints(ControlPointsConfig(), torch.zeros(0, 3), BOX, 10, torch.Generator())

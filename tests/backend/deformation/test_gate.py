@@ -47,8 +47,8 @@ def test_change_is_measured_in_pixels_colour_and_opacity():
 
 def test_what_is_only_displaced_does_not_move():
     m = model(10)
-    there = [Deltas(torch.full((10, 3), 0.2), torch.zeros(10, 4)) for _ in range(3)]
-    change, mean = change_of(m, torch.arange(10), there, torch.full((10,), 100.0), GateConfig())
+    deltas = [Deltas(torch.full((10, 3), 0.2), torch.zeros(10, 4)) for _ in range(3)]
+    change, mean = change_of(m, torch.arange(10), deltas, torch.full((10,), 100.0), GateConfig())
     assert float(change.max()) < 1e-3
     torch.testing.assert_close(mean.means, torch.full((10, 3), 0.2))
     assert mean.sh0 is None
@@ -57,10 +57,10 @@ def test_what_is_only_displaced_does_not_move():
 def test_times_at_which_nobody_saw_it_say_nothing():
     m, rows = model(10), torch.arange(10)
     places = torch.tensor([0.1, 0.1, 0.7])
-    asked = [Deltas(place.expand(10, 3).clone(), torch.zeros(10, 4)) for place in places]
+    deltas = [Deltas(place.expand(10, 3).clone(), torch.zeros(10, 4)) for place in places]
     seen = torch.tensor([True, True, False])[:, None].repeat(1, 10)
     seen[:, 4], seen[:, 7] = True, False
-    change, mean = change_of(m, rows, asked, torch.full((10,), 100.0), GateConfig(), seen)
+    change, mean = change_of(m, rows, deltas, torch.full((10,), 100.0), GateConfig(), seen)
     assert float(change[0]) < 1e-3
     torch.testing.assert_close(mean.means[0], torch.full((3,), 0.1))
     for row in (4, 7):  # seen at all times, or at none: both use the mean over all times
@@ -77,7 +77,7 @@ def test_the_piece_that_moves_stays_open_and_little_else():
     assert stays[m.params["means"].detach()[:, 0] < 0.7].float().mean() < 0.03
 
 
-def test_what_cameras_that_are_a_little_off_make_of_a_still_scene_does_not_stay_open():
+def test_small_camera_errors_do_not_open_static_gaussians():
     m, rows = model(), torch.arange(400)
     moves = m.params["means"].detach()[:, 0] > 0.85
     # As measured on a real clip: half of all Gaussians change by more than the threshold, but none moves.

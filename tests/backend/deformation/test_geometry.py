@@ -121,8 +121,8 @@ def test_the_compiled_search_finds_what_sorting_finds(dims, points, count):
     places[: points // 2] += 30.0
     got = nearest(queries, places, count)
     want = torch.cdist(queries.double(), places.double()).sort(dim=1).values[:, :count]
-    there = (queries[:, None].double() - places[got].double()).norm(dim=2)
-    torch.testing.assert_close(there, want, rtol=1e-6, atol=1e-6)
+    distances = (queries[:, None].double() - places[got].double()).norm(dim=2)
+    torch.testing.assert_close(distances, want, rtol=1e-6, atol=1e-6)
     assert all(len(set(row)) == count for row in got.tolist())
 
 

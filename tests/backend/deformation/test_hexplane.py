@@ -59,14 +59,14 @@ def test_stretched_axes_are_fine_where_the_gaussians_are():
     start = Start(means, field_box(means), means, 10, 0, torch.Generator().manual_seed(0))
     nodes = {}
     for stretch in (0.0, 2.0):
-        made = host("hexplane").create(HexPlaneConfig(features=4, resolution=8, time_nodes=5, stretch=stretch), start)
+        field = host("hexplane").create(HexPlaneConfig(features=4, resolution=8, time_nodes=5, stretch=stretch), start)
         with torch.no_grad():  # the first plane counts nodes along x; all others are 1
-            for n, plane in enumerate((*made.spatial, *made.temporal)):
+            for n, plane in enumerate((*field.spatial, *field.temporal)):
                 plane.copy_(torch.arange(8.0).expand_as(plane) if n == 0 else torch.ones_like(plane))
-        at = made.features_at(people, torch.tensor([0.5]))[:, 0]
+        at = field.features_at(people, torch.tensor([0.5]))[:, 0]
         nodes[stretch] = float((at.max() - at.min()).detach())
-        again = host("hexplane").restore(made.config, made.state())
-        assert torch.equal(again.features_at(means, torch.tensor([0.2])), made.features_at(means, torch.tensor([0.2])))
+        again = host("hexplane").restore(field.config, field.state())
+        assert torch.equal(again.features_at(means, torch.tensor([0.2])), field.features_at(means, torch.tensor([0.2])))
     assert nodes[2.0] > 10.0 * nodes[0.0]
 
 

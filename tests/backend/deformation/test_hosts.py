@@ -37,7 +37,7 @@ def create(name, configuration="default", means=None, iterations=1000):
     return registry.host(name).create(registry.host_config(name, configuration, iterations), start(means))
 
 
-def own_rows(field, count):
+def parameter_rows(field, count):
     return {n: torch.full((count, *owned.shape), owned.value).requires_grad_() for n, owned in field.owned.items()}
 
 
@@ -49,7 +49,7 @@ def stir(field, scale=0.05):
     return field
 
 
-def test_the_hosts_of_the_issue_are_there():
+def test_all_expected_hosts_exist():
     assert {"hexplane", "mlp", "control_points"} <= set(HOSTS)
     with pytest.raises(ValueError, match="mlp"):
         registry.host("nerf")
@@ -57,35 +57,35 @@ def test_the_hosts_of_the_issue_are_there():
         registry.host_config("mlp", "published", 100)
 
 
-def test_only_a_host_with_an_axis_to_size_asks_how_many_nodes_time_needs():
+def test_only_hosts_with_a_time_axis_compute_its_node_count():
     """Computing the number of time nodes renders dozens of frames."""
-    asked = []
+    calls = []
 
     def nodes():
-        asked.append(True)
+        calls.append(True)
         return 7
 
     for name in HOSTS:
         for configuration in registry.CONFIGURATIONS:
             begin = dataclasses.replace(start(cloud().params["means"].detach()), time_nodes=nodes)
             field = registry.host(name).create(registry.host_config(name, configuration, 1000), begin)
-            assert bool(asked) == ((name, configuration) == ("hexplane", "default"))
-            assert not asked or field.config.time_nodes == 7
-            asked.clear()
+            assert bool(calls) == ((name, configuration) == ("hexplane", "default"))
+            assert not calls or field.config.time_nodes == 7
+            calls.clear()
 
 
 @pytest.mark.parametrize("name", ["hexplane", "control_points"])
 def test_what_a_host_calls_is_compiled_before_it_is_called(name, monkeypatch):
     """Warm-up compiles all snippets in the main thread, before the first step is timed."""
-    for made in (planes._sampler, planes._penalty, geometry._search):  # left by another test
-        made.cache_clear()
+    for cached in (planes._sampler, planes._penalty, geometry._search):  # left by another test
+        cached.cache_clear()
     spec = registry.host(name)
     spec.warm_up(spec.settings())
     compiled = []
     monkeypatch.setattr(native, "build", lambda *_: compiled.append(True))
     means = cloud().params["means"].detach()
     field = create(name, means=means)
-    field(means, torch.tensor([0.5]), own_rows(field, len(means)))
+    field(means, torch.tensor([0.5]), parameter_rows(field, len(means)))
     field.regularisation(0.5, torch.Generator().manual_seed(0))
     assert not compiled
 
@@ -96,7 +96,7 @@ def test_identity_at_construction(name):
     field = create(name)
     rows = torch.arange(len(model))
     for t in (0.0, 0.37, 1.0):
-        deltas = field(model.params["means"], torch.tensor([t]), own_rows(field, len(model)))
+        deltas = field(model.params["means"], torch.tensor([t]), parameter_rows(field, len(model)))
         state = apply_deltas(model, rows, deltas, field.rules)
         for key in PARAM_NAMES:
             assert float((state[key] - model.params[key]).detach().abs().max()) < 1e-3, key
@@ -107,10 +107,10 @@ def test_identity_at_construction(name):
 def test_a_time_for_all_is_the_same_time_for_each(name, configuration):
     field = stir(create(name, configuration))
     means = cloud(30).params["means"].detach()
-    own = own_rows(field, 30)
-    one = field(means, torch.tensor([0.4]), own)
-    many = field(means, torch.full((30,), 0.4), own)
-    mixed = field(means, torch.cat([torch.full((10,), 0.4), torch.full((20,), 0.9)]), own)
+    rows = parameter_rows(field, 30)
+    one = field(means, torch.tensor([0.4]), rows)
+    many = field(means, torch.full((30,), 0.4), rows)
+    mixed = field(means, torch.cat([torch.full((10,), 0.4), torch.full((20,), 0.9)]), rows)
     for a, b, c in zip(one.moved().values(), many.moved().values(), mixed.moved().values(), strict=True):
         assert a.shape[0] == 30
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
@@ -146,20 +146,20 @@ def rigid(means, t):
 def test_it_fits_a_rigid_motion(name, configuration):
     means = cloud().params["means"].detach()
     field = create(name, configuration, means, iterations=100_000)
-    own = own_rows(field, len(means))
+    rows = parameter_rows(field, len(means))
     groups = [{"params": g["params"], "lr": max(2e-3, g["lr"])} for g in field.parameter_groups()]
-    optimizer = torch.optim.Adam([*groups, *({"params": [p], "lr": 1e-2} for p in own.values())])
+    optimizer = torch.optim.Adam([*groups, *({"params": [p], "lr": 1e-2} for p in rows.values())])
     generator = torch.Generator().manual_seed(1)
     start_error = torch.stack([(rigid(means, float(t)) - means).norm(dim=1).mean() for t in TIMES]).mean()
     for _ in range(200):
         t = TIMES[torch.randint(8, (1,), generator=generator)]
         optimizer.zero_grad()
-        loss = (means + field(means, t, own).means - rigid(means, t)).square().sum(1).mean()
+        loss = (means + field(means, t, rows).means - rigid(means, t)).square().sum(1).mean()
         (loss + field.regularisation(0.1, generator)).backward()
         optimizer.step()
     with torch.no_grad():
         error = torch.stack(
-            [(means + field(means, t[None], own).means - rigid(means, t)).norm(dim=1).mean() for t in TIMES]
+            [(means + field(means, t[None], rows).means - rigid(means, t)).norm(dim=1).mean() for t in TIMES]
         )
     assert float(error.mean()) < 0.15 * float(start_error)
 
@@ -174,18 +174,18 @@ def test_coincident_gaussians_give_finite_gradients(name, configuration):
     field = registry.host(name).create(
         config, Start(means, box, means + box[0], 8, 3, torch.Generator().manual_seed(0))
     )
-    own = own_rows(field, 20)
-    deltas = field(means, torch.rand(20, generator=torch.Generator().manual_seed(4)), own)
+    rows = parameter_rows(field, 20)
+    deltas = field(means, torch.rand(20, generator=torch.Generator().manual_seed(4)), rows)
     total = torch.stack([d.square().sum() for d in deltas.moved().values()]).sum()
     (total + field.regularisation(0.2, torch.Generator().manual_seed(5))).backward()
     assert bool(torch.isfinite(total))
-    for parameter in [*field.parameters(), *own.values()]:
+    for parameter in [*field.parameters(), *rows.values()]:
         assert parameter.grad is None or bool(torch.isfinite(parameter.grad).all())
 
 
 @pytest.mark.parametrize("configuration", registry.CONFIGURATIONS)
 @pytest.mark.parametrize("name", HOSTS)
-def test_restored_from_its_state_alone(name, configuration):
+def test_field_is_restored_from_its_state(name, configuration):
     field = stir(create(name, configuration))
     again = registry.host(name).restore(registry.host_config(name, configuration, 1000), field.state())
     means = cloud(15, 3).params["means"].detach()
@@ -290,10 +290,10 @@ def test_rehearsal_finds_a_motion_and_places_the_nodes():
     field = registry.host("control_points").create(config, start(means))
     times = TIMES.tolist()
     shift = torch.tensor([0.3, 0.0, 0.0])
-    asked = []
+    calls = []
 
     def loss(state, frame):
-        asked.append(len(state["means"]))
+        calls.append(len(state["means"]))
         assert state["log_scales"].unique().numel() == 1
         assert state["shN"].shape[1] == 0
         # The centre of the surrogates should follow the motion: the start positions plus the shift.
@@ -302,10 +302,10 @@ def test_rehearsal_finds_a_motion_and_places_the_nodes():
 
     field.rehearse(Rehearsal(means, torch.rand(300, 3), times, 200, loss, torch.Generator().manual_seed(0)))
     # Surrogates multiply from a twentieth of the stage on, up to 16 per node; then the nodes are sampled.
-    assert asked[:11] == [300] * 11
-    assert asked[:150] == sorted(asked[:150])
-    assert asked[149] == 16 * 40
-    assert asked[150:] == [40] * 50
+    assert calls[:11] == [300] * 11
+    assert calls[:150] == sorted(calls[:150])
+    assert calls[149] == 16 * 40
+    assert calls[150:] == [40] * 50
     assert field.places.shape == (40, 3)
     paths = field.trajectories(field.places, torch.tensor([0.0, 1.0]))
     travel = (paths[1] - paths[0]).mean(0).detach()

@@ -32,7 +32,7 @@ def test_the_published_network_has_its_published_size():
     assert field.config.start == pytest.approx(0.075)
 
 
-def test_published_scales_are_added_after_the_exponential_and_held_in_the_domain():
+def test_published_scales_are_added_after_exp_and_clamped():
     logs = torch.tensor([[0.1, 0.2, 0.3]]).log().requires_grad_()
     got = add_to_scale(logs, torch.tensor([[0.05, 0.0, -0.4]]))
     assert got.exp()[0].tolist() == pytest.approx([0.15, 0.2, MIN_SCALE])
@@ -54,7 +54,7 @@ def test_our_rotations_are_products():
     assert float(got.norm()) == pytest.approx(1.0)
 
 
-def test_six_dof_is_still_at_the_start_and_has_gradients_there():
+def test_six_dof_starts_static_with_nonzero_gradients():
     field = Mlp(MlpConfig(six_dof=True), BOX, 10, torch.Generator().manual_seed(0))
     with torch.no_grad():
         for head in field.heads.values():

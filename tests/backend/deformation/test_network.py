@@ -34,7 +34,7 @@ def pulled(results, pulls):
     torch.stack([(value * pull).sum() for value, pull in zip(results, pulls, strict=True)]).sum().backward()
 
 
-def off(got, want):
+def relative_error(got, want):
     return float((got.double() - want).norm() / want.norm())
 
 
@@ -54,9 +54,9 @@ def test_values_and_gradients_match_float64(count, inputs, width, sizes):
     pulled(got, pulls)
     pulled(want, [pull.double() for pull in pulls])
     assert [value.shape for value in got] == [(count, size) for size in sizes]
-    assert max(off(a.detach(), b.detach()) for a, b in zip(got, want, strict=True)) < 1e-5
+    assert max(relative_error(a.detach(), b.detach()) for a, b in zip(got, want, strict=True)) < 1e-5
     pairs = zip([at, *leaves(*ours)], [exactly_at, *leaves(*exact)], strict=True)
-    assert max(off(a.grad, b.grad) for a, b in pairs) < 1e-5
+    assert max(relative_error(a.grad, b.grad) for a, b in pairs) < 1e-5
 
 
 def test_far_out_it_bends_as_silu_does():
@@ -82,25 +82,27 @@ def test_any_number_of_threads_gives_the_same_bits():
     x = torch.randn(5003, 32, generator=torch.Generator().manual_seed(3))
     results = []
     for threads in (1, 2, 3, 8):
-        made, at = layers(), x.clone().requires_grad_()
-        value = network.network(at, *made, threads)
+        linear_layers, at = layers(), x.clone().requires_grad_()
+        value = network.network(at, *linear_layers, threads)
         torch.stack([part.square().sum() for part in value]).sum().backward()
-        results.append(torch.cat([t.detach().flatten() for t in (*value, at.grad, *(p.grad for p in leaves(*made)))]))
-    assert all(torch.equal(results[0], other) for other in results[1:])
+        results.append(
+            torch.cat([t.detach().flatten() for t in (*value, at.grad, *(p.grad for p in leaves(*linear_layers)))])
+        )
+    assert all(torch.equal(results[0], repeated) for repeated in results[1:])
 
 
 def test_no_rows_at_all():
-    made, x = layers(), torch.zeros(0, 32, requires_grad=True)
-    value = network.network(x, *made)
+    linear_layers, x = layers(), torch.zeros(0, 32, requires_grad=True)
+    value = network.network(x, *linear_layers)
     torch.stack([part.sum() for part in value]).sum().backward()
     assert [part.shape for part in value] == [(0, n) for n in SIZES]
-    assert all(float(p.grad.abs().max()) == 0.0 for p in leaves(*made))
+    assert all(float(p.grad.abs().max()) == 0.0 for p in leaves(*linear_layers))
 
 
-def test_the_field_goes_through_it_and_other_networks_go_through_torch(monkeypatch):
-    asked = []
+def test_field_uses_the_kernel_and_other_networks_use_torch(monkeypatch):
+    calls = []
     whole = network.network
-    monkeypatch.setattr(network, "network", lambda *args: asked.append(args) or whole(*args))
+    monkeypatch.setattr(network, "network", lambda *args: calls.append(args) or whole(*args))
     box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
     means, times = torch.rand(5, 3), torch.tensor([0.5])
     for config in (
@@ -111,12 +113,12 @@ def test_the_field_goes_through_it_and_other_networks_go_through_torch(monkeypat
     ):
         field = HexPlane(config, box, torch.Generator().manual_seed(0), harmonics=8)
         field(means, times)
-        assert len(asked) == 0
+        assert len(calls) == 0
     usual = HexPlane(HexPlaneConfig(time_nodes=4), box, torch.Generator().manual_seed(0))
     usual(means, times)
-    assert len(asked) == 1
+    assert len(calls) == 1
     usual.double()(means.double(), times.double())
-    assert len(asked) == 1
+    assert len(calls) == 1
     trunk, heads = layers(24)
     with pytest.raises(ValueError, match="16"):
         network.network(torch.zeros(1, 24), trunk, heads)

@@ -30,7 +30,7 @@ def on_every_body(*rows):
 
 def fields(features=16, levels=(1, 2), time_nodes=7, **more):
     """The same field in float32 and float64, with random planes; `published`, so that points receive gradients."""
-    made = []
+    leaves = []
     for dtype in (torch.float32, torch.float64):
         config = HexPlaneConfig(
             features=features, resolution=9, levels=levels, time_nodes=time_nodes, published=True, **more
@@ -40,8 +40,8 @@ def fields(features=16, levels=(1, 2), time_nodes=7, **more):
         with torch.no_grad():
             for plane in field._by_level():
                 plane += 0.3 * torch.randn(plane.shape, generator=g)
-        made.append(field.to(dtype))
-    return made
+        leaves.append(field.to(dtype))
+    return leaves
 
 
 def points(count=301):
@@ -72,21 +72,21 @@ def test_samples_and_every_gradient_match_float64(body, features, levels, time_n
     assert got.shape == (len(where), features * len(levels))
     assert relative(got, want) <= bound
     # On a node or the border, the gradient of a point is one-sided, and rounding decides the side.
-    here, leaves = where[4:].to(device).requires_grad_(), on(device, ours)
-    there, time = (where[4:, part].double().requires_grad_() for part in (slice(0, 3), 3))
-    pull = torch.randn(len(here), got.shape[1], generator=torch.Generator().manual_seed(3))
-    module.features(here, leaves).backward(pull.to(device))
-    exact.features_at(there, time).backward(pull.double())
+    ours_at, leaves = where[4:].to(device).requires_grad_(), on(device, ours)
+    exact_at, time = (where[4:, part].double().requires_grad_() for part in (slice(0, 3), 3))
+    pull = torch.randn(len(ours_at), got.shape[1], generator=torch.Generator().manual_seed(3))
+    module.features(ours_at, leaves).backward(pull.to(device))
+    exact.features_at(exact_at, time).backward(pull.double())
     for p, q in zip(leaves, exact._by_level(), strict=True):
         assert p.grad.stride() == p.stride()
         assert relative(p.grad, q.grad) <= bound
-    assert relative(here.grad[:, :3], there.grad) <= bound_of_points
+    assert relative(ours_at.grad[:, :3], exact_at.grad) <= bound_of_points
     if time_nodes > 1:
-        assert relative(here.grad[:, 3], time.grad) <= bound_of_points
+        assert relative(ours_at.grad[:, 3], time.grad) <= bound_of_points
     else:
-        assert not here.grad[:, 3].any()
+        assert not ours_at.grad[:, 3].any()
     outside = (where[4:].abs() > 1).all(1)
-    assert bool(outside.any()) and not here.grad.cpu()[outside].any()
+    assert bool(outside.any()) and not ours_at.grad.cpu()[outside].any()
 
 
 @pytest.mark.parametrize(("body", "features"), on_every_body((16,), (5,)))
@@ -106,12 +106,12 @@ def test_the_penalty_and_its_gradient_match_float64(body, features):
 def test_the_penalty_bends_along_rows_on_both_bodies():
     ours, _ = fields()
     weights = [(0.3, 0.7, 0.2)] * 12
-    leaves, others = on("cpu", ours), on("cpu", ours)
-    got, want = planes_cuda.penalty(leaves, weights), planes.penalty(others, weights)
+    leaves, reference = on("cpu", ours), on("cpu", ours)
+    got, want = planes_cuda.penalty(leaves, weights), planes.penalty(reference, weights)
     assert float(got.detach()) == pytest.approx(float(want.detach()), rel=1e-6)
     got.backward()
     want.backward()
-    for p, q in zip(leaves, others, strict=True):
+    for p, q in zip(leaves, reference, strict=True):
         torch.testing.assert_close(p.grad, q.grad, rtol=1e-4, atol=1e-7)
 
 
@@ -136,12 +136,12 @@ def test_any_number_of_threads_gives_the_same_bits():
         value = planes.features(at, ours, threads)
         (value.square().sum() + planes.penalty(ours, [(1.0, 0.5, 0.2)] * 12, threads)).backward()
         results.append(torch.cat([value.detach().flatten(), *(p.grad.flatten() for p in (at, *ours))]))
-    assert all(torch.equal(results[0], other) for other in results[1:])
+    assert all(torch.equal(results[0], repeated) for repeated in results[1:])
 
 
 @pytest.mark.parametrize("module", [planes, planes_cuda])
 @pytest.mark.parametrize("odd", [math.nan, math.inf, -math.inf])
-def test_a_point_that_is_nowhere_stays_on_the_rim(module, odd):
+def test_non_finite_point_is_clamped_to_the_border(module, odd):
     ours, _ = fields()
     leaves, where = on("cpu", ours), torch.full((3, 4), odd, requires_grad=True)
     value = module.features(where, leaves)
@@ -161,7 +161,7 @@ def test_no_points_at_all(body, features):
     assert value.shape == (0, 32) and not any(bool(p.grad.any()) for p in leaves)
 
 
-def test_other_planes_are_refused_by_the_processors_body_and_taken_by_torch():
+def test_unsupported_planes_fall_back_to_torch():
     (ours, exact), (odd, _) = fields(), fields(features=5)
     assert planes.supports(ours._by_level()) and not planes.supports(exact._by_level())
     with pytest.raises(ValueError, match="16"):

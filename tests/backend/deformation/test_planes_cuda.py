@@ -28,7 +28,7 @@ def test_what_it_does_not_take_is_refused_and_what_the_self_test_refused_is_torc
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-def test_a_field_on_a_card_is_given_to_it():
+def test_field_on_a_gpu_uses_its_kernels():
     ours, _ = fields()
     field, where = ours.to("cuda"), points().cuda()
     got = field.features_at(where[:, :3], where[:, 3])
@@ -36,12 +36,12 @@ def test_a_field_on_a_card_is_given_to_it():
 
 
 @pytest.mark.parametrize("arch", [75, 90, 120])
-def test_kernels_compile_for_gpus_that_are_not_here(tmp_path, arch):
+def test_kernels_compile_for_absent_gpus(tmp_path, arch):
     wp = initialised_warp()
     module = planes_cuda.kernels(16).samples.module
     wp.compile_aot_module(module, arch=arch, module_dir=str(tmp_path), use_ptx=True)
-    (made,) = tmp_path.rglob("*.ptx")
-    text = made.read_text(errors="replace")
+    (ptx,) = tmp_path.rglob("*.ptx")
+    text = ptx.read_text(errors="replace")
     # A thread reads four channels at once, adds with atomics, and keeps its data in registers.
     assert len(re.findall(r"ld\.(global\.)?v4", text)) == 24 and text.count("atom.global.add.f32") == 24
     assert "ld.local" not in text

@@ -21,7 +21,7 @@ def _imported(root, name, first=1, last=20, size=(640, 360), source=(1920, 1080)
 def requests():
     """requests(**freeze): parameters of a command line without options, except these of the freeze."""
 
-    def made(**freeze):
+    def make(**freeze):
         params = FreezeParams(only_missing=True)
         return {
             "import": ImportParams(),
@@ -30,7 +30,7 @@ def requests():
             "freeze": dataclasses.replace(params, **freeze),
         }
 
-    return made
+    return make
 
 
 @pytest.fixture

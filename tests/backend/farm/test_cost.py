@@ -62,31 +62,35 @@ def test_a_training_costs_its_steps_and_pixels_and_an_instant_too(shot, requests
 def test_what_a_job_costs(shot, requests):
     found = shots_of(shot, requests, count=3)
     steps = [step for one in found for step in steps_of(one, 5, False)]
-    told = estimate(steps, ONE, True, False)
+    cost = estimate(steps, ONE, True, False)
     # per shot: solve, train, 2 opened, 2 x 4 parts, 2 finished
-    assert (told.shots, told.tasks) == (3, 3 * 14)
-    own, engine = sum(row.core_seconds for row in told.rows[:-1]), told.rows[-1]
-    assert own == pytest.approx(3 * 14 * 2.0) and told.core_hours == pytest.approx((own + engine.core_seconds) / 3600)
-    beside = 3 * 5 * rates.SESSION_SECONDS + 3 * 14 * rates.TASK_SECONDS
-    assert (engine.kind, engine.tasks) == ("engine", 3 * 5) and engine.seconds == pytest.approx(beside)
-    assert engine.core_seconds == pytest.approx(beside + 3 * 14 * rates.WATCH_CORES), "it watches every second of tasks"
-    assert told.card_hours == pytest.approx(3 * (1 + 2 + 8) / 3600), "train, open and freeze"
-    assert told.critical_seconds == pytest.approx(5 * (1.0 + rates.SESSION_SECONDS + rates.TASK_SECONDS))
-    assert told.on_hosts[1] == pytest.approx(3 * 14 + beside)
-    assert told.on_hosts[100] == pytest.approx(told.critical_seconds)
-    assert told.on_hosts[1] / 2 <= told.on_hosts[2] < told.on_hosts[1] * 0.7
-    assert told.disk_gb == pytest.approx(3 * (2 * 20 * 1920 * 1080 * 50 + 100e6) / 1e9, rel=0.01)
-    said = "\n".join(sentences(told, "of nobody"))
+    assert (cost.shots, cost.tasks) == (3, 3 * 14)
+    task_core_seconds, engine = sum(row.core_seconds for row in cost.rows[:-1]), cost.rows[-1]
+    assert task_core_seconds == pytest.approx(3 * 14 * 2.0) and cost.core_hours == pytest.approx(
+        (task_core_seconds + engine.core_seconds) / 3600
+    )
+    overhead_seconds = 3 * 5 * rates.SESSION_SECONDS + 3 * 14 * rates.TASK_SECONDS
+    assert (engine.kind, engine.tasks) == ("engine", 3 * 5) and engine.seconds == pytest.approx(overhead_seconds)
+    assert engine.core_seconds == pytest.approx(overhead_seconds + 3 * 14 * rates.WATCH_CORES), (
+        "it watches every second of tasks"
+    )
+    assert cost.card_hours == pytest.approx(3 * (1 + 2 + 8) / 3600), "train, open and freeze"
+    assert cost.critical_seconds == pytest.approx(5 * (1.0 + rates.SESSION_SECONDS + rates.TASK_SECONDS))
+    assert cost.on_hosts[1] == pytest.approx(3 * 14 + overhead_seconds)
+    assert cost.on_hosts[100] == pytest.approx(cost.critical_seconds)
+    assert cost.on_hosts[1] / 2 <= cost.on_hosts[2] < cost.on_hosts[1] * 0.7
+    assert cost.disk_gb == pytest.approx(3 * (2 * 20 * 1920 * 1080 * 50 + 100e6) / 1e9, rel=0.01)
+    said = "\n".join(sentences(cost, "of nobody"))
     assert "3 shots, 42 tasks. Estimated from rates of nobody" in said and "freeze       24 tasks" in said
     assert "engine       15 sessions" in said
     assert estimate(steps, ONE, False, False).card_hours == 0.0
 
 
-def test_a_session_is_entered_again_after_so_many_tasks(shot, requests):
+def test_session_restarts_after_a_number_of_tasks(shot, requests):
     (one,) = shots_of(shot, requests)
     steps = steps_of(one, 5, False)
     keeps, enters = estimate(steps, ONE, False, False), estimate(steps, ONE, False, False, 1)
-    assert [told.rows[-1].tasks for told in (keeps, enters)] == [5, 14]
+    assert [cost.rows[-1].tasks for cost in (keeps, enters)] == [5, 14]
     assert estimate(steps, ONE, False, False, 3).rows[-1].tasks == 1 + 1 + 1 + 3 + 1
     more = 9 * rates.SESSION_SECONDS
     assert enters.on_hosts[1] - keeps.on_hosts[1] == pytest.approx(more)
@@ -94,10 +98,10 @@ def test_a_session_is_entered_again_after_so_many_tasks(shot, requests):
     assert enters.critical_seconds == pytest.approx(keeps.critical_seconds), "the first task of each step enters, too"
 
 
-def test_hosts_are_asked_for_what_was_seen_and_half_as_much_again():
-    asked = needs({"train": Rate(1, 1, 1, 2000), "bake": Rate(1, 1, 1, 700)}, True, 2.0)
-    assert (asked["train"].memory_mib, asked["train"].gpu) == (3072, True)
-    assert (asked["bake"].memory_mib, asked["bake"].gpu) == (1536, False)
+def test_requested_memory_is_measured_memory_plus_half():
+    needed = needs({"train": Rate(1, 1, 1, 2000), "bake": Rate(1, 1, 1, 700)}, True, 2.0)
+    assert (needed["train"].memory_mib, needed["train"].gpu) == (3072, True)
+    assert (needed["bake"].memory_mib, needed["bake"].gpu) == (1536, False)
 
 
 def record(step, amount, seconds, cpu=None, memory=800):
@@ -127,7 +131,7 @@ def test_more_work_never_takes_less_time():
     assert steep.fixed == 0.0 and steep.per_unit == pytest.approx(3.0)
 
 
-def test_rates_of_a_file_stand_in_the_place_of_ours(tmp_path):
+def test_rates_file_overrides_built_in_rates(tmp_path):
     file = tmp_path / "rates.json"
     write_json(file, to_json({"train": Rate(1.0, 2.0, 3.0, 4)}))
     read = read_rates(file)

@@ -13,7 +13,7 @@ from torch_backend.farm.shots import gather, parse_instants, read_instants, read
 from torch_backend.footage.images import write_png
 
 
-def test_takes_are_named_by_their_instants_where_there_are_several(shot, requests):
+def test_several_takes_are_named_by_their_instants(shot, requests):
     roots = [str(shot("hall").root), str(shot("kitchen").root)]
     hall, kitchen = gather(roots, requests(take="hero"), [4, 12], {"kitchen": [7]}, "")
     assert hall.takes == {"4": "hero_0004", "12": "hero_0012"} and kitchen.takes == {"7": "hero"}
@@ -52,7 +52,7 @@ def video(tmp_path_factory):
 def clip(tmp_path, video):
     """clip("a/plate.mp4"): path of a video; for a name with #, the pattern of a sequence."""
 
-    def made(name):
+    def make(name):
         path = tmp_path / "clips" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         if "#" in name:
@@ -63,7 +63,7 @@ def clip(tmp_path, video):
             shutil.copyfile(video, path)
         return str(path)
 
-    return made
+    return make
 
 
 LONG = "the_long_and_winding_name_of_a_clip_that_somebody_gave_it"
@@ -82,7 +82,7 @@ LONG = "the_long_and_winding_name_of_a_clip_that_somebody_gave_it"
         ("c/Hall.mp4", "d/hall.mp4", "e/h\u00e4ll.mp4", "f/ha\u0308ll.mp4"),
     ],
 )
-def test_no_two_clips_have_one_shot_and_each_finds_its_own_again(clip, requests, tmp_path, names, in_one_folder):
+def test_clips_get_distinct_shots_and_find_them_again(clip, requests, tmp_path, names, in_one_folder):
     clips = [clip(name) for name in names]
     folder = str(tmp_path / "shots") if in_one_folder else ""
     found = {one.clip: one for one in gather(clips, requests(), [], {}, folder)}
@@ -91,23 +91,27 @@ def test_no_two_clips_have_one_shot_and_each_finds_its_own_again(clip, requests,
         assert len({unicodedata.normalize("NFC", value).casefold() for value in values}) == len(names), values
     assert {one.clip: one for one in gather(clips[::-1], requests(), [], {}, folder)} == found
     for path in clips:
-        (alone,) = gather([path], requests(), [], {}, folder)
-        assert alone.root == found[path].root, "as it is found alone"
+        (entry,) = gather([path], requests(), [], {}, folder)
+        assert entry.root == found[path].root, "as it is found alone"
 
 
-def test_a_clip_has_the_shot_that_was_made_of_it_and_no_other(clip, imported, requests, tmp_path):
+def test_clip_matches_only_the_shot_imported_from_it(clip, imported, requests, tmp_path):
     path, folder = clip("hall.mp4"), tmp_path / "clips"
     (one,) = gather([path], requests(), [], {}, "")
     assert one.root == folder / "hall.splannequin" and (one.name, one.output) == ("hall", "hall")
-    (other,) = gather([path], requests(), [], {}, str(tmp_path / "shots"))
-    assert other.root.parent == tmp_path / "shots" and other.name == "hall" and other.output == shot_name(other.root)
-    made = imported(folder, "hall")
-    for source, root in ((path, made.root), (clip("else/hall.mp4"), None)):
-        write_json(made.info_path, {"version": 1, "name": "hall", "source": source})
+    (second_entry,) = gather([path], requests(), [], {}, str(tmp_path / "shots"))
+    assert (
+        second_entry.root.parent == tmp_path / "shots"
+        and second_entry.name == "hall"
+        and second_entry.output == shot_name(second_entry.root)
+    )
+    hall = imported(folder, "hall")
+    for source, root in ((path, hall.root), (clip("else/hall.mp4"), None)):
+        write_json(hall.info_path, {"version": 1, "name": "hall", "source": source})
         (one,) = gather([path], requests(), [], {}, "")
-        assert (one.root == made.root) == (root is not None)
-    write_json(made.info_path, {"version": 1, "name": "hall", "source": path})
-    assert len(gather([str(made.root), path], requests(), [], {}, "")) == 1
+        assert (one.root == hall.root) == (root is not None)
+    write_json(hall.info_path, {"version": 1, "name": "hall", "source": path})
+    assert len(gather([str(hall.root), path], requests(), [], {}, "")) == 1
 
 
 def test_an_instant_is_named_for_one_of_two_shots_of_a_name(imported, requests, tmp_path):
@@ -124,30 +128,30 @@ def test_names_that_every_task_would_refuse_are_refused_at_once(shot, requests, 
         gather([str(shot("hall").root)], requests(**{field: name}), [], {}, "")
 
 
-def test_what_is_done_is_told_from_what_is_not(shot, requests):
-    made = shot("hall")
-    (one,) = gather([str(made.root)], requests(), [], {}, "")
+def test_finished_work_is_distinguished_from_open_work(shot, requests):
+    hall = shot("hall")
+    (one,) = gather([str(hall.root)], requests(), [], {}, "")
     assert (one.solved, one.trained) == (False, False)
-    write_json(made.cameras, {})
+    write_json(hall.cameras, {})
     for name in ("summary.json", "checkpoint.safetensors"):
-        (made.run("main")).mkdir(parents=True, exist_ok=True)
-        (made.run("main") / name).write_text("{}")
-    (one,) = gather([str(made.root)], requests(), [], {}, "")
+        (hall.run("main")).mkdir(parents=True, exist_ok=True)
+        (hall.run("main") / name).write_text("{}")
+    (one,) = gather([str(hall.root)], requests(), [], {}, "")
     assert (one.solved, one.trained) == (True, True)
-    (one,) = gather([str(made.root)], requests(), [], {}, "", trained_counts=False)
+    (one,) = gather([str(hall.root)], requests(), [], {}, "", trained_counts=False)
     assert not one.trained, "where other settings are asked for"
-    (one,) = gather([str(made.root)], requests(run="other"), [], {}, "")
+    (one,) = gather([str(hall.root)], requests(run="other"), [], {}, "")
     assert not one.trained
 
 
 def test_a_camera_path_goes_into_the_shot(shot, requests, tmp_path):
-    made = shot("hall")
+    hall = shot("hall")
     write_json(
         tmp_path / "move.json", {"version": 1, "width": 64, "height": 48, "frames": [{"frame": 7}, {"frame": 9}]}
     )
-    (one,) = gather([str(made.root)], requests(camera_path=str(tmp_path / "move.json")), [], {}, "")
+    (one,) = gather([str(hall.root)], requests(camera_path=str(tmp_path / "move.json")), [], {}, "")
     assert one.requests["freeze"]["camera_path"] == "paths/freeze.json"
-    assert (made.root / "paths" / "freeze.json").is_file() and (one.first, one.last) == (7, 9)
+    assert (hall.root / "paths" / "freeze.json").is_file() and (one.first, one.last) == (7, 9)
 
 
 @pytest.mark.parametrize(
@@ -179,11 +183,11 @@ def test_a_list_of_instants(tmp_path):
         parse_instants("x")
 
 
-def test_parameters_of_a_file_stand_over_the_options(tmp_path, requests):
+def test_file_parameters_override_options(tmp_path, requests):
     file = tmp_path / "request.json"
     write_json(file, {"freeze": {"width": 320, "t_star_per_frame": {"3": 4.0}}, "train": {"preset": "final"}})
-    asked = read_requests(str(file), requests(take="hero"))
-    assert (asked["freeze"].width, asked["freeze"].take, asked["train"].preset) == (320, "hero", "final")
+    read = read_requests(str(file), requests(take="hero"))
+    assert (read["freeze"].width, read["freeze"].take, read["train"].preset) == (320, "hero", "final")
     wrongs = ({"bake": {}}, "'bake' is none of"), ({"freeze": {"wide": 3}}, "wide"), ({"train": {"preset": "x"}}, "'x'")
     for wrong, said in wrongs:
         write_json(file, wrong)

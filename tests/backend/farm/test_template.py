@@ -18,21 +18,21 @@ from torch_backend.farm.work import steps_of
 @pytest.fixture
 def shots(shot):
     """Two shots; the name of one contains the syntax of a template reference."""
-    hall, other = shot("hall").root, shot("kitchen", last=23)
-    write_json(other.info_path, {"version": 1, "name": "kit {{chen}}"})
-    return [str(hall), str(other.root)]
+    hall, kitchen = shot("hall").root, shot("kitchen", last=23)
+    write_json(kitchen.info_path, {"version": 1, "name": "kit {{chen}}"})
+    return [str(hall), str(kitchen.root)]
 
 
 @pytest.fixture
 def job(tmp_path, shots, capsys):
     """job(*words): (template, parameters, folder) of `farm export` of both shots with these options."""
 
-    def made(*words):
+    def make(*words):
         folder = tmp_path / "job"
         assert cli.main(["farm", "export", *shots, "--output", str(folder), *words]) == 0, capsys.readouterr().err
         return *(json.loads((folder / name).read_text()) for name in ("template.json", "parameters.json")), folder
 
-    return made
+    return make
 
 
 def named(template, name):
@@ -61,7 +61,7 @@ def test_what_an_import_finds_is_no_file_of_the_farm(job):
     assert '"ignore_mask": "found"' in str(named(template, "hall: solve"))
 
 
-def test_each_shot_has_a_chain_of_its_own(job):
+def test_each_shot_has_a_separate_task_chain(job):
     template, *_ = job("--t-star", "4,12", "--bake")
     kinds = ["solve", "train", "open", "freeze", "finish", "bake", "deliver"]
     for shot in ("hall", "kit __chen__"):
@@ -92,7 +92,7 @@ def strings(node, at=()):
             yield from strings(value, at)
 
 
-def test_paths_of_the_submitting_computer_stand_only_where_they_are_mapped(job, tmp_path):
+def test_submitter_paths_appear_only_where_mapped(job, tmp_path):
     (tmp_path / "mask.png").touch()
     template, values, _ = job("--t-star", "4", "--bake", "--people-mask", str(tmp_path / "mask.png"))
     types = {one["name"]: one["type"] for one in template["parameterDefinitions"]}
@@ -113,7 +113,7 @@ def test_paths_of_the_submitting_computer_stand_only_where_they_are_mapped(job, 
     assert "--paths" not in named(template, "hall: train")["script"]["actions"]["onRun"]["args"]
 
 
-def test_what_a_task_is_asked_for_comes_out_of_its_file_again(job, tmp_path):
+def test_task_parameters_round_trip_through_their_file(job, tmp_path):
     (tmp_path / "request.json").write_text('{"freeze": {"t_star_per_frame": {"3": 4.0}, "camera_path": ""}}')
     template, *_ = job("--freeze-width", "320", "--request", str(tmp_path / "request.json"))
     file = named(template, "kit __chen__: freeze")["script"]["embeddedFiles"][0]
@@ -127,7 +127,7 @@ def test_what_a_task_is_asked_for_comes_out_of_its_file_again(job, tmp_path):
         read_request(tmp_path / "out.json")
 
 
-def test_hosts_with_a_card_are_asked_for_where_one_is_wanted(job):
+def test_gpu_hosts_are_requested_where_needed(job):
     for device, cards in (("cuda", ["train", "open", "freeze"]), ("auto", [])):
         template, *_ = job("--device", device)
         found = [
@@ -138,7 +138,7 @@ def test_hosts_with_a_card_are_asked_for_where_one_is_wanted(job):
         assert found == [f"{shot}: {kind}" for kind in cards for shot in ("hall", "kit __chen__")]
 
 
-def test_many_shots_are_several_jobs(shots, tmp_path):
+def test_many_shots_are_split_into_several_jobs(shots, tmp_path):
     assert cli.main(["farm", "export", *shots, "--output", str(tmp_path), "--shots-per-job", "1"]) == 0
     names = [json.loads((tmp_path / f"job-00{n}" / "template.json").read_text())["name"] for n in (1, 2)]
     assert names == ["Splannequin: hall", "Splannequin: kit __chen__"]
@@ -170,19 +170,19 @@ def test_whatever_shots_are_called_the_engine_takes_the_job(tmp_path, imported, 
     template = json.loads((tmp_path / "job" / "template.json").read_text())
     values = json.loads((tmp_path / "job" / "parameters.json").read_text())
     read = model.decode_job_template(template=template)
-    given = model.preprocess_job_parameters(
+    preprocessed = model.preprocess_job_parameters(
         job_template=read, job_parameter_values=values, job_template_dir=tmp_path / "job",
         current_working_dir=tmp_path, allow_job_template_dir_walk_up=True,
     )  # fmt: skip
-    job = model.create_job(job_template=read, job_parameter_values=given)
+    job = model.create_job(job_template=read, job_parameter_values=preprocessed)
     assert len({step.name for step in job.steps}) == len(job.steps) == len(ODD) * 7
 
 
-def test_what_a_task_is_told_is_what_was_asked_for_whatever_it_holds(shot, requests):
+def test_task_arguments_survive_special_characters(shot, requests):
     model = pytest.importorskip("openjd.model")
     odd = "a}}}b{{{c}}{{d\x7f\udcff\n\\u007d"
-    asked = requests(t_star_per_frame={odd: 1.0})
-    (one,) = gather([str(shot("hall").root)], asked, [], {}, "")
+    expected = requests(t_star_per_frame={odd: 1.0})
+    (one,) = gather([str(shot("hall").root)], expected, [], {}, "")
     steps = steps_of(one, 10, False)
     template = job_template("odd", steps, {step.kind: Needs(512, False) for step in steps}, False)
     model.decode_job_template(template=template)

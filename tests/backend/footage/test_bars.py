@@ -28,21 +28,21 @@ def grey(frames):
 def barred(frames, top=0, bottom=0, left=0, right=0, colour=0):
     out = []
     for frame in frames:
-        made = np.full_like(frame, colour)
+        framed = np.full_like(frame, colour)
         inner = slice(top, HEIGHT - bottom), slice(left, WIDTH - right)
-        made[inner] = frame[inner]
-        out.append(made)
+        framed[inner] = frame[inner]
+        out.append(framed)
     return out
 
 
-def blurred_beside(frames, size):
+def blurred_sides(frames, size):
     """Middle of each frame over a blurred, enlarged copy of the frame's middle."""
     out = []
     for frame in frames:
         middle = np.ascontiguousarray(frame[:, size : WIDTH - size])
-        made = cv2.GaussianBlur(cv2.resize(middle, (WIDTH, HEIGHT)), (0, 0), 7)
-        made[:, size : WIDTH - size] = middle
-        out.append(made)
+        blurred = cv2.GaussianBlur(cv2.resize(middle, (WIDTH, HEIGHT)), (0, 0), 7)
+        blurred[:, size : WIDTH - size] = middle
+        out.append(blurred)
     return out
 
 
@@ -62,12 +62,12 @@ def test_bars_of_one_colour_are_found_where_they_are(world, sides, colour):
 
 @pytest.mark.parametrize("size", [30, 60])
 def test_blurred_pillars_are_found_where_they_are(world, size):
-    pictures = grey(blurred_beside(world, size))
+    pictures = grey(blurred_sides(world, size))
     assert find_bars(pictures) == Bars(left=size, right=size)
     assert find_bars([np.ascontiguousarray(picture.T) for picture in pictures]) == Bars(top=size, bottom=size)
 
 
-def test_a_subtitle_in_a_bar_and_a_picture_that_is_dark_at_the_other_do_not_hide_them(world):
+def test_bars_are_found_despite_subtitles_and_dark_pictures(world):
     frames = barred([(f * np.linspace(1, 0.05, HEIGHT)[:, None, None]).astype(np.uint8) for f in world], 20, 20)
     for frame in frames[:12]:
         frame[6:12, 70:110] = 255
@@ -103,14 +103,14 @@ def shallow(world):
     return [(f * (1 - weight) + cv2.GaussianBlur(f, (0, 0), 7) * weight).astype(np.uint8) for f in world]
 
 
-@pytest.mark.parametrize("made", [list, darkened, skyline, door, shallow, lambda world: barred(world[:1] * 24, top=20)])
-def test_what_belongs_to_the_scene_is_none(world, made):
-    assert find_bars(grey(made(world))) == Bars()
+@pytest.mark.parametrize("case", [list, darkened, skyline, door, shallow, lambda world: barred(world[:1] * 24, top=20)])
+def test_what_belongs_to_the_scene_is_none(world, case):
+    assert find_bars(grey(case(world))) == Bars()
 
 
 @pytest.mark.parametrize("blurs", [False, True])
 def test_an_import_says_what_the_picture_fills_and_masks_the_rest(tmp_path, world, write_video, recorder, blurs):
-    frames = blurred_beside(world, 30) if blurs else barred(world, left=30, right=30)
+    frames = blurred_sides(world, 30) if blurs else barred(world, left=30, right=30)
     write_video(tmp_path / "a.mp4", frames)
     shot, report = Shot.create(tmp_path / "shot"), recorder()
     import_footage(shot, str(tmp_path / "a.mp4"), FootageConfig(), report)

@@ -44,7 +44,7 @@ def test_a_logo_is_found_whole_where_it_is_and_nothing_else(panned):
     assert mark is not None and (mark & inside).sum() > 0.9 * inside.sum()
 
 
-def test_a_clip_without_one_and_a_camera_that_stands_have_none(panned, pan):
+def test_clean_or_static_clip_has_no_burnt_in_marks(panned, pan):
     assert find_mark(grey(panned)) is None
     frames, _ = stamped([panned[0]] * 30, 280, 150)
     assert find_mark(grey(frames)) is None, "all of it stands: nobody can tell"
@@ -54,28 +54,28 @@ def test_a_clip_without_one_and_a_camera_that_stands_have_none(panned, pan):
     assert find_mark(grey(small)[:8]) is None and find_mark([g[:, :128] for g in grey(small)]) is None
 
 
-def test_a_cameras_own_rim_is_left_alone(panned):
+def test_camera_vignette_is_not_masked(panned):
     rimmed = [np.pad(frame[:, :-2], ((0, 0), (0, 2), (0, 0))) for frame in panned]
     assert find_mark(grey(rimmed)) is None
 
 
-def test_so_many_pictures_are_looked_at_and_no_more():
+def test_number_of_examined_pictures_is_bounded():
     assert looked_at(0) == [] and looked_at(3) == [0, 1, 2] and len(looked_at(5000)) == 48
     assert looked_at(5000)[0] == 0 and looked_at(5000)[-1] == 4999
 
 
-def test_an_import_says_so_writes_the_mask_and_takes_it_away_with_the_clip(tmp_path, panned, write_video, recorder):
+def test_import_reports_writes_and_removes_the_burnt_in_mask(tmp_path, panned, write_video, recorder):
     frames, inside = stamped(panned, 280, 150)
     write_video(tmp_path / "marked.mp4", frames, rate=10)
     write_video(tmp_path / "clean.mp4", panned, rate=10)
     shot, report = Shot.create(tmp_path / "a.splannequin"), recorder()
     import_footage(shot, str(tmp_path / "marked.mp4"), FootageConfig(step=1), report)
     (said,) = report.warnings
-    told, file = load_frames(shot)["burnt_in"], shot.burnt_in
+    record, file = load_frames(shot)["burnt_in"], shot.burnt_in
     assert said.startswith(
-        f"{100 * told['share']:.1f} % of the picture stands still while the camera moves, for example a logo"
+        f"{100 * record['share']:.1f} % of the picture stands still while the camera moves, for example a logo"
     )
-    assert told["share"] == pytest.approx(float((read_png(file)[..., 0] > 0).mean()), abs=1e-5)
+    assert record["share"] == pytest.approx(float((read_png(file)[..., 0] > 0).mean()), abs=1e-5)
     (mask,) = read_masks(shot, {"ignore": str(file), "people": ""}, recorder()).values()
     assert (mask.of(5) & inside).sum() > 0.97 * inside.sum(), "the solve takes it as it is"
     report = recorder()

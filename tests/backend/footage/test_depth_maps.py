@@ -21,16 +21,16 @@ def write(path: Path, channels: dict[str, np.ndarray], kind=oiio.FLOAT):
 
 
 RAMP = np.linspace(0.1, 0.9, 64 * 48, dtype=np.float32).reshape(48, 64)
-OTHER = np.full_like(RAMP, 0.3)
+UNRELATED = np.full_like(RAMP, 0.3)
 
 
 @pytest.mark.parametrize(
     "channels",
     [
         {"Z": RAMP},
-        {"R": OTHER, "G": OTHER, "B": 2 * OTHER, "Z": RAMP},
-        {"ViewLayer.Combined.R": OTHER, "ViewLayer.Depth.Z": RAMP},
-        {"Normal.X": OTHER, "Normal.Y": OTHER, "Normal.Z": OTHER, "depth.V": RAMP},
+        {"R": UNRELATED, "G": UNRELATED, "B": 2 * UNRELATED, "Z": RAMP},
+        {"ViewLayer.Combined.R": UNRELATED, "ViewLayer.Depth.Z": RAMP},
+        {"Normal.X": UNRELATED, "Normal.Y": UNRELATED, "Normal.Z": UNRELATED, "depth.V": RAMP},
         {"Y": RAMP},
         {"whatever": RAMP},
         {"R": RAMP, "G": RAMP, "B": RAMP},
@@ -41,10 +41,10 @@ def test_the_channel_of_depth_is_found_in_an_exr(tmp_path, channels):
     np.testing.assert_allclose(read_map(tmp_path / "a.exr"), RAMP, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("ending", "kind", "off"), [("png", oiio.UINT16, 1e-5), ("tif", oiio.UINT16, 1e-5)])
-def test_whole_numbers_of_16_bits_are_read(tmp_path, ending, kind, off):
+@pytest.mark.parametrize(("ending", "kind", "tolerance"), [("png", oiio.UINT16, 1e-5), ("tif", oiio.UINT16, 1e-5)])
+def test_whole_numbers_of_16_bits_are_read(tmp_path, ending, kind, tolerance):
     write(tmp_path / f"a.{ending}", {"Y": RAMP}, kind)
-    np.testing.assert_allclose(read_map(tmp_path / f"a.{ending}"), RAMP, atol=off)
+    np.testing.assert_allclose(read_map(tmp_path / f"a.{ending}"), RAMP, atol=tolerance)
 
 
 def test_what_is_not_finite_or_zero_or_endlessly_far_is_unknown(tmp_path):
@@ -59,8 +59,8 @@ def test_what_is_not_finite_or_zero_or_endlessly_far_is_unknown(tmp_path):
 @pytest.mark.parametrize(
     "channels",
     [
-        {"R": RAMP, "G": OTHER, "B": OTHER},
-        {"Normal.X": OTHER, "Normal.Y": OTHER, "Normal.Z": RAMP},
+        {"R": RAMP, "G": UNRELATED, "B": UNRELATED},
+        {"Normal.X": UNRELATED, "Normal.Y": UNRELATED, "Normal.Z": RAMP},
         {"Z": np.full_like(RAMP, np.nan)},
         {"Z": np.zeros_like(RAMP)},
     ],
@@ -71,7 +71,7 @@ def test_pictures_that_hold_no_depth_are_of_no_use(tmp_path, channels):
         read_map(tmp_path / "a.exr")
 
 
-def test_maps_go_by_number_and_what_is_of_no_use_is_told_with_its_reason(world, quiet, tmp_path):
+def test_maps_match_by_number_and_unusable_ones_are_reported(world, quiet, tmp_path):
     folder = tmp_path / "depth"
     for n in range(16):
         write(folder / f"d.{101 + n:04d}.exr", {"Z": RAMP + n})
@@ -83,10 +83,10 @@ def test_maps_go_by_number_and_what_is_of_no_use_is_told_with_its_reason(world, 
     read = {frame: found.read(frame) for frame in range(101, 117)}
     assert [frame for frame, values in read.items() if values is None] == [103, 104, 105, 106]
     np.testing.assert_allclose(read[110], RAMP + 9, rtol=1e-6)
-    told = found.refused_words(16)
-    assert told.startswith("4 of 16 ") and told.count("\n") == 0
+    messages = found.refused_words(16)
+    assert messages.startswith("4 of 16 ") and messages.count("\n") == 0
     assert all(
-        part in told for part in ("frame 103 is missing", "frame 104 cannot be read", "64x20", "frame 106 holds")
+        part in messages for part in ("frame 103 is missing", "frame 104 cannot be read", "64x20", "frame 106 holds")
     )
 
 
@@ -99,7 +99,7 @@ def test_the_key_follows_the_contents(world, quiet, tmp_path):
     assert find_depth(world.shot, str(tmp_path), quiet()).key != before
 
 
-def test_a_folder_that_is_not_there_or_holds_no_sequence_is_refused(world, quiet, tmp_path):
+def test_missing_folder_or_no_sequence_is_refused(world, quiet, tmp_path):
     for place in (tmp_path / "nowhere", tmp_path):
         with pytest.raises(JobError) as refused:
             find_depth(world.shot, str(place), quiet())

@@ -51,14 +51,14 @@ def test_without_a_shoulder_nothing_is_touched():
 
 
 @pytest.mark.parametrize("display", [PLAIN, ROLLED])
-def test_alpha_is_taken_away_before_the_curve(display):
+def test_alpha_is_unpremultiplied_before_the_curve(display):
     shown = np.array([0.5, 0.9, 0.97], np.float32)
     rgba = np.append(shown * 0.25, np.float32(0.25))
     expected = np.append(display.to_light(shown) * 0.25, 0.25)
     np.testing.assert_allclose(display.premultiplied_to_light(rgba), expected, rtol=2e-4)
 
 
-def test_a_lamp_that_is_made_smaller_is_nowhere_brighter_than_it_is():
+def test_downscaled_highlight_has_no_overshoot():
     """With the shoulder's encoding, a resampling kernel with overshoot would make the lamp's rim three times as
     bright."""
     plate = np.full((96, 128, 3), 0.1, np.float16)
@@ -95,7 +95,7 @@ def test_an_exr_of_lamps_is_imported_with_them(tmp_path, recorder):
     np.testing.assert_allclose(light[kept], picture.astype(np.float32)[kept], rtol=1e-3, atol=1e-5)
 
 
-def test_a_finished_import_of_before_is_left_alone(tmp_path, recorder):
+def test_finished_import_of_an_older_version_is_kept(tmp_path, recorder):
     wall = np.random.default_rng(0).uniform(0.1, 0.9, (48, 100, 3)).astype(np.float16)
     for n in range(9):
         out = oiio.ImageOutput.create(str(tmp_path / f"a.{n}.exr"))

@@ -53,22 +53,20 @@ def contents(shot):
     return {str(p.relative_to(shot.root)): p.read_bytes() for p in shot.root.rglob("*") if p.is_file()}
 
 
-@pytest.mark.parametrize("other", ["clip", "range", "height", "colour"])
-def test_an_import_of_other_frames_into_a_shot_with_work_is_refused_and_changes_nothing(
-    worked_on, clips, recorder, other
-):
+@pytest.mark.parametrize("change", ["clip", "range", "height", "colour"])
+def test_import_of_different_frames_into_a_shot_with_work_is_refused(worked_on, clips, recorder, change):
     before = contents(worked_on)
-    settings = {"range": {"first": 3}, "height": {"working_height": 24}, "colour": {"levels": "full"}}.get(other, {})
+    settings = {"range": {"first": 3}, "height": {"working_height": 24}, "colour": {"levels": "full"}}.get(change, {})
     with pytest.raises(JobError) as refused:
-        import_footage(worked_on, clips[other == "clip"], FootageConfig(**settings), recorder())
+        import_footage(worked_on, clips[change == "clip"], FootageConfig(**settings), recorder())
     assert refused.value.exit_code == ExitCode.USAGE and "--replace" in refused.value.hint
     assert contents(worked_on) == before
 
 
-@pytest.mark.parametrize("alone", [0, 2, 3, 4, 5, 6, 7])  # 1: solve.json without cameras does not count as a solve
-def test_each_kind_of_work_is_reason_enough_to_refuse(worked_on, clips, recorder, alone):
+@pytest.mark.parametrize("kind", [0, 2, 3, 4, 5, 6, 7])  # 1: solve.json without cameras does not count as a solve
+def test_each_kind_of_work_is_reason_enough_to_refuse(worked_on, clips, recorder, kind):
     for number, path in enumerate(work(worked_on)):
-        if number != alone:
+        if number != kind:
             path.unlink()
     with pytest.raises(JobError, match="would replace its frames"):
         import_footage(worked_on, clips[1], FootageConfig(), recorder())

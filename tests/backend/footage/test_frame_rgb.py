@@ -269,7 +269,7 @@ def stored(path, clip):
 def test_decoded_clips_are_what_their_codes_say(tmp_path, frame_of_planes, clip):
     path, codes = tmp_path / f"clip.{clip.suffix}", patch_codes(clip)
     written(path, clip, frame_of_planes, codes)
-    held = stored(path, clip) if clip.loses or clip.kind.startswith("gray") else codes
+    stored_codes = stored(path, clip) if clip.loses or clip.kind.startswith("gray") else codes
     source = open_source(str(path))
     frames = list(source.frames(None, None))
     check_facts(source, frames, clip)
@@ -279,12 +279,12 @@ def test_decoded_clips_are_what_their_codes_say(tmp_path, frame_of_planes, clip)
     down = max(1.0, 1 / float(Fraction(clip.aspect)))
     rows = (np.arange(codes.shape[1]) * PATCH + PATCH // 2) * down
     columns = (np.arange(codes.shape[2]) * PATCH + PATCH // 2) * across
-    got, expected = pixels[np.ix_(rows.astype(int), columns.astype(int))], reference(held, clip)
+    got, expected = pixels[np.ix_(rows.astype(int), columns.astype(int))], reference(stored_codes, clip)
     step = 1 / 255 if depth(clip.kind) == 8 else 1 / 1023
     inside = ((expected > 0) & (expected < 1)).all(-1)
     assert np.abs(got - expected).max() < step
     assert np.abs((got - expected)[inside].mean(0)).max() < 0.2 * step
-    if (reference(held, clip)[0, 0] >= 1).all():
+    if (reference(stored_codes, clip)[0, 0] >= 1).all():
         # With non-square pixels resampled, 16-bit white is 65531: FFmpeg's Lanczos weights do not sum to exactly 1.
         assert (got[0, 0] >= (1.0 if clip.aspect == "1" or step == 1 / 255 else 0.9999)).all(), "white"
     intended = reference(codes, replace(clip, decoded=""))
@@ -318,8 +318,8 @@ def test_a_person_outdoes_the_file(tmp_path, frame_of_planes):
     source = open_source(str(tmp_path / "a.mkv"), overrides=Overrides("bt709", "full", Fraction(2)))
     got = next(iter(source.frames(None, None))).pixels[8::16, 16::32] / 65535
     assert np.abs(got - reference(codes, true)).max() < 1 / 1023
-    told = [source.info.reading[name] for name in ("matrix", "matrix_told", "range", "range_told", "pixel_aspect")]
-    assert told == ["ITU709", True, "full", True, 2.0]
+    reading = [source.info.reading[name] for name in ("matrix", "matrix_told", "range", "range_told", "pixel_aspect")]
+    assert reading == ["ITU709", True, "full", True, 2.0]
     assert np.abs(got - reference(codes, says)).max() > 8 / 1023, "the case should show whether it is heeded"
 
 

@@ -34,7 +34,7 @@ def files(folder):
     return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
 
 
-def test_every_frame_of_the_range_is_there_and_the_step_thins_only_the_solve(shot, clip, recorder):
+def test_every_frame_is_imported_and_step_affects_only_the_solve(shot, clip, recorder):
     result = import_footage(shot, clip, FootageConfig(first=3, last=18, step=2), recorder())
     record = load_frames(shot)
     assert [f["frame"] for f in record["frames"]] == list(range(3, 19))
@@ -69,7 +69,7 @@ def test_a_second_import_of_the_same_does_nothing(shot, clip, recorder):
     assert {p: p.stat().st_mtime_ns for p in shot.frames.rglob("*.png")} == before
 
 
-def test_another_import_replaces_frames_and_the_solve_made_from_them(shot, clip, recorder):
+def test_new_import_replaces_frames_and_their_solve(shot, clip, recorder):
     import_footage(shot, clip, FootageConfig(), recorder())
     shot.solve.mkdir()
     (shot.solve / "solve.json").write_text("{}")
@@ -110,7 +110,7 @@ def test_nothing_is_removed_through_a_link(shot, clip, tmp_path, recorder, linke
     assert files(theirs) == ["000001.png"]
 
 
-def test_a_killed_import_leaves_what_was_there(shot, clip, recorder):
+def test_killed_import_keeps_the_previous_import(shot, clip, recorder):
     """The import dies when the old frames are moved away and the new ones are not yet in place."""
     import_footage(shot, clip, FootageConfig(), recorder())
     before = files(shot.frames)
@@ -128,7 +128,7 @@ def test_a_lost_frame_is_imported_again(shot, clip, recorder):
     assert (shot.frames / "raw/000007.png").is_file()
 
 
-def test_a_cancelled_import_leaves_what_was_there(shot, clip, recorder):
+def test_cancelled_import_keeps_the_previous_import(shot, clip, recorder):
     import_footage(shot, clip, FootageConfig(), recorder())
     before = files(shot.root)
     with pytest.raises(Cancelled):
@@ -248,7 +248,7 @@ def test_a_shot_of_before_whose_frames_count_backwards_is_to_be_imported_again(s
         load_frames(shot)
 
 
-def test_a_sequence_has_the_rate_that_is_asked_for(shot, sequence, recorder):
+def test_sequence_has_the_requested_rate(shot, sequence, recorder):
     folder = str(sequence(1))
     assert import_footage(shot, folder, FootageConfig(step=1), recorder())["fps"] == 24.0
     report = recorder()
@@ -268,7 +268,7 @@ def test_a_sequence_that_was_moved_is_the_same_footage(shot, sequence, recorder)
     assert not (shot.solve / "of these frames").exists()
 
 
-def test_a_rate_or_a_layer_for_a_video_is_told_to_be_passed_over(shot, clip, recorder):
+def test_ignored_rate_or_layer_of_a_video_is_reported(shot, clip, recorder):
     report = recorder()
     assert import_footage(shot, clip, FootageConfig(fps=50.0, layer="rgba"), report)["fps"] == 10.0
     assert report.warnings == [
@@ -297,9 +297,9 @@ def test_the_listing_says_how_the_footage_was_read(shot, clip, sequence, recorde
 
 
 def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, sequence, recorder):
-    told = import_footage(shot, clip, FootageConfig(), recorder())["read_as"]
+    reading = import_footage(shot, clip, FootageConfig(), recorder())["read_as"]
     assert (
-        told
+        reading
         == load_frames(shot)["read_as"]
         == [
             "Read as 64 x 48, square pixels, 10 fps, 8 bits, video, Rec.709, matrix BT.601, video levels, no alpha.",
@@ -313,8 +313,8 @@ def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, 
         "Assumed, for the footage does not say: colour space.",
     ]
     report = recorder()
-    told = import_footage(shot, str(sequence(1)), chosen, report)["read_as"]
-    assert told == [
+    reading = import_footage(shot, str(sequence(1)), chosen, report)["read_as"]
+    assert reading == [
         "Read as 128 x 48, pixels 2 times as wide, 24 fps, 8 bits, sRGB, Rec.709, no alpha.",
         "Frames 1 to 12 are read from shot.####.png.",
         "Assumed, for the footage does not say: rate.",
@@ -322,7 +322,7 @@ def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, 
     assert "The matrix 'bt709' is ignored: pictures already store RGB." in report.warnings
 
 
-def test_a_full_disk_is_told_before_the_work(shot, clip, recorder, monkeypatch):
+def test_missing_disk_space_is_reported_before_the_work(shot, clip, recorder, monkeypatch):
     usage = shutil.disk_usage(shot.root)._replace(free=1 << 20)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     error = refused(shot, recorder, clip)
@@ -344,30 +344,30 @@ def test_frames_json_is_plain(shot, clip, recorder):
 
 def test_an_import_is_known_by_what_version_0_2_noted_of_it(shot, clip, recorder):
     info = open_source(clip).info
-    asked = {"first": 2, "last": 19, "step": 2, "working_height": 96, "fps": 0.0}
-    config = FootageConfig(source=clip, **asked)
-    assert import_key(info, config) == content_key(1, info.key, asked)
-    named = FootageConfig(source=clip, layer="left", **asked)
-    assert import_key(info, named) == content_key(1, info.key, {**asked, "layer": "left"})
+    settings = {"first": 2, "last": 19, "step": 2, "working_height": 96, "fps": 0.0}
+    config = FootageConfig(source=clip, **settings)
+    assert import_key(info, config) == content_key(1, info.key, settings)
+    named = FootageConfig(source=clip, layer="left", **settings)
+    assert import_key(info, named) == content_key(1, info.key, {**settings, "layer": "left"})
     import_footage(shot, clip, config, recorder())
     noted = json.loads(shot.listing.read_text())
-    assert noted["config"].items() >= {**asked, "layer": ""}.items() and noted["key"] == import_key(info, config)
+    assert noted["config"].items() >= {**settings, "layer": ""}.items() and noted["key"] == import_key(info, config)
 
 
 @pytest.mark.parametrize("kind", ["video", "sequence"])
 def test_a_copy_of_the_footage_is_the_same_footage(shot, clip, pan, tmp_path, recorder, kind):
     """A copy as made by `cp -r`, with another folder, name and times, keeps the solve."""
-    there = tmp_path / "copied"
-    there.mkdir()
+    copied = tmp_path / "copied"
+    copied.mkdir()
     if kind == "video":
-        first, copy = clip, shutil.copyfile(clip, there / "other.mp4")
+        first, copy = clip, shutil.copyfile(clip, copied / "other.mp4")
     else:
         (tmp_path / "plates").mkdir()
         for n, pixels in enumerate(pan(12), 1):
             write_png(tmp_path / "plates" / f"p.{n:04d}.png", pixels)
-            shutil.copyfile(tmp_path / "plates" / f"p.{n:04d}.png", there / f"q.{n:04d}.png")
-        first, copy = str(tmp_path / "plates" / "p.0001.png"), there / "q.0001.png"
-    for file in there.iterdir():
+            shutil.copyfile(tmp_path / "plates" / f"p.{n:04d}.png", copied / f"q.{n:04d}.png")
+        first, copy = str(tmp_path / "plates" / "p.0001.png"), copied / "q.0001.png"
+    for file in copied.iterdir():
         os.utime(file, (1, 1))
     import_footage(shot, first, FootageConfig(), recorder())
     shot.solve.mkdir()
@@ -389,7 +389,7 @@ def test_an_import_that_an_earlier_version_knew_by_times_stays_while_they_are_th
     assert load_frames(shot)["key"] == record["key"] != old
 
 
-def test_an_option_that_comes_later_leaves_finished_imports_alone():
+def test_new_option_keeps_finished_imports_valid():
     """A new option changes the key of an import only if it differs from its default."""
     old = FootageConfig(first=1, step=2)
     info = SourceInfo(64, 48, 24.0, 1, 9, False, False, "srgb", ["clip"])
@@ -434,7 +434,7 @@ def test_an_import_killed_between_its_frames_and_shot_json_is_ended_by_the_next_
 @pytest.mark.parametrize(
     ("black", "white", "is_flat"), [(0.093, 0.6, True), (0.125, 0.85, True), (0.0, 0.6, False), (0.1, 1.0, False)]
 )
-def test_a_clip_as_flat_as_log_is_told_so(shot, tmp_path, pan, write_video, recorder, black, white, is_flat):
+def test_log_like_clip_is_reported(shot, tmp_path, pan, write_video, recorder, black, white, is_flat):
     grey = [np.repeat(f.mean(2, keepdims=True), 3, axis=2) for f in pan(10)]
     grey = [(f - f.min()) / np.ptp(f) for f in grey]
     frames = [np.rint(255 * (black + f * (white - black))).astype(np.uint8) for f in grey]

@@ -66,8 +66,8 @@ def test_another_content_of_the_look_is_another_import(tmp_path, pan, write_vide
     write_video(tmp_path / "a.mp4", pan(8))
     keys = []
     for write in (write_1d, write_3d):
-        told = overrides_of(FootageConfig(lut=str(write(tmp_path / "look.cube"))))
-        keys.append(open_source(str(tmp_path / "a.mp4"), overrides=told).info.key)
+        interpretation = overrides_of(FootageConfig(lut=str(write(tmp_path / "look.cube"))))
+        keys.append(open_source(str(tmp_path / "a.mp4"), overrides=interpretation).info.key)
     assert keys[0] != keys[1]
 
 
@@ -92,6 +92,6 @@ def test_what_is_no_look_is_refused_in_one_sentence(tmp_path, pan, write_video, 
     assert caught.value.exit_code == ExitCode.FOOTAGE
 
 
-def test_a_look_and_a_colour_space_are_one_too_many():
+def test_look_and_colour_space_together_are_refused():
     with pytest.raises(JobError, match="^Both a colour space"):
         overrides_of(FootageConfig(lut="a.cube", colour_space="ACEScg"))

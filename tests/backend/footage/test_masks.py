@@ -26,9 +26,9 @@ def shot(tmp_path, pan, recorder):
     (tmp_path / "clip").mkdir()
     for number, pixels in zip(FRAMES, pan(10), strict=True):
         write_png(tmp_path / "clip" / f"f.{number}.png", pixels)
-    made = Shot.create(tmp_path / "a.splannequin")
-    import_footage(made, str(tmp_path / "clip"), FootageConfig(), recorder())
-    return made
+    new_shot = Shot.create(tmp_path / "a.splannequin")
+    import_footage(new_shot, str(tmp_path / "clip"), FootageConfig(), recorder())
+    return new_shot
 
 
 def white(covered):
@@ -70,7 +70,7 @@ def test_a_sequence_goes_by_number_and_may_have_more_frames(shot, recorder, tmp_
     assert not report.warnings
 
 
-def test_as_many_pictures_as_frames_are_taken_in_order_and_that_is_said(shot, recorder, tmp_path):
+def test_unnumbered_masks_are_matched_in_order_and_reported(shot, recorder, tmp_path):
     report = recorder()
     mask = read_masks(shot, {"people": write_masks(tmp_path / "m", range(10))}, report)["people"]
     assert (mask.of(110) == np.roll(COVERED, 9, axis=1)).all()
@@ -82,13 +82,13 @@ def test_a_larger_mask_is_brought_to_the_frames_size(shot, recorder, tmp_path):
     assert (masks_of(shot, recorder, ignore=tmp_path / "logo.png")["ignore"].of(105) == COVERED).all()
 
 
-def test_a_video_masks_by_its_own_count(shot, recorder, tmp_path, write_video):
+def test_mask_video_is_matched_by_frame_count(shot, recorder, tmp_path, write_video):
     write_video(tmp_path / "m.mp4", [white(np.roll(COVERED, n, axis=1)) for n in range(10)])
     mask = masks_of(shot, recorder, people=tmp_path / "m.mp4")["people"]
     assert all((mask.of(frame) == np.roll(COVERED, frame - 101, axis=1)).all() for frame in FRAMES)
 
 
-def test_what_a_picture_s_own_alpha_takes_away_is_not_covered(shot, recorder, tmp_path):
+def test_transparent_footage_pixels_are_not_covered(shot, recorder, tmp_path):
     write_rgba(tmp_path / "logo.png", np.full((48, 64, 3), 255, np.uint8), np.where(COVERED, 255, 0).astype(np.uint8))
     assert (masks_of(shot, recorder, ignore=tmp_path / "logo.png")["ignore"].of(105) == COVERED).all()
 
@@ -155,7 +155,7 @@ def test_the_alpha_of_a_video_is_turned_as_its_picture_is(tmp_path, pan, recorde
     assert found.shape == (64, 48) and (found == np.rot90(COVERED)).all()
 
 
-def test_a_video_without_alpha_is_told_to_have_none(tmp_path, pan, recorder, write_video):
+def test_mask_video_without_alpha_is_reported(tmp_path, pan, recorder, write_video):
     write_video(tmp_path / "a.mp4", pan(10))
     shot = Shot.create(tmp_path / "a.splannequin")
     import_footage(shot, str(tmp_path / "a.mp4"), FootageConfig(), recorder())
@@ -166,8 +166,8 @@ def test_a_video_without_alpha_is_told_to_have_none(tmp_path, pan, recorder, wri
 def test_a_mask_is_known_by_what_it_covers_and_not_by_its_file(shot, recorder, tmp_path):
     first = masks_of(shot, recorder, people=write_masks(tmp_path / "m", FRAMES))["people"]
     again = masks_of(shot, recorder, people=write_masks(tmp_path / "n", FRAMES))["people"]
-    other = masks_of(shot, recorder, people=write_masks(tmp_path / "o", FRAMES, np.roll(COVERED, 1, 0)))["people"]
-    assert first.key == again.key != other.key
+    second = masks_of(shot, recorder, people=write_masks(tmp_path / "o", FRAMES, np.roll(COVERED, 1, 0)))["people"]
+    assert first.key == again.key != second.key
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_an_alpha_that_varies_is_the_mask(shot, recorder, tmp_path, rgb, alpha, 
     assert (masks_of(shot, recorder, people=source)["people"].of(105) == expected).all()
 
 
-def test_frames_without_the_person_do_not_change_how_the_others_are_read(shot, recorder, tmp_path):
+def test_empty_mask_frames_do_not_change_the_reading_of_others(shot, recorder, tmp_path):
     (tmp_path / "m").mkdir()
     for number in FRAMES:
         alpha = np.where(COVERED, 255, 0) if number > 104 else 0
@@ -271,7 +271,7 @@ def test_a_mask_of_far_more_pixels_than_the_footage_is_refused_before_they_are_r
 
 
 @pytest.mark.parametrize("size", [(16000, 12000), (100_000, 75_000)])
-def test_a_picture_that_announces_too_many_pixels_is_refused_before_they_are_read(shot, recorder, tmp_path, size):
+def test_oversized_picture_is_refused_before_decoding(shot, recorder, tmp_path, size):
     (tmp_path / "m.png").write_bytes(announced(*size))
     words = f"{size[0]} x {size[1]} pixels"
     with pytest.raises(JobError, match=words) as error:

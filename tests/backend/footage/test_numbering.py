@@ -42,13 +42,11 @@ COUNTED = [("video", 1), ("files", 0)]
 
 @pytest.mark.parametrize("footage", [*COUNTED, ("files", 20240101)], indirect=True)
 @pytest.mark.parametrize("skipped", [0, 3])
-def test_the_shot_counts_from_its_start_and_every_frame_is_read_again_as_its_own(
-    tmp_path, footage, pictures, recorder, skipped
-):
+def test_shot_is_numbered_from_its_start_frame(tmp_path, footage, pictures, recorder, skipped):
     """Plates have full height although working frames have a quarter: plates are read from the footage."""
-    source, own = footage
+    source, file_numbers = footage
     shot = Shot.create(tmp_path / "a.splannequin")
-    config = FootageConfig(start=1001, first=own + skipped if skipped else None, working_height=24)
+    config = FootageConfig(start=1001, first=file_numbers + skipped if skipped else None, working_height=24)
     import_footage(shot, str(source), config, recorder())
     numbers = [row["frame"] for row in load_frames(shot)["frames"]]
     assert numbers == list(range(1001, 1001 + COUNT - skipped))
@@ -62,17 +60,17 @@ def test_the_shot_counts_from_its_start_and_every_frame_is_read_again_as_its_own
 
 
 @pytest.mark.parametrize("footage", COUNTED, indirect=True)
-def test_an_import_without_a_start_stays_finished_also_where_the_start_is_the_footages_own(tmp_path, footage, recorder):
-    source, own = footage
+def test_import_stays_finished_if_the_start_equals_the_footage_start(tmp_path, footage, recorder):
+    source, file_numbers = footage
     shot = Shot.create(tmp_path / "a.splannequin")
     import_footage(shot, str(source), FootageConfig(), recorder())
     before = json.loads(shot.listing.read_text())
     assert "shift" not in before
     shot.solve.mkdir()
-    for start in (None, own):
+    for start in (None, file_numbers):
         import_footage(shot, str(source), FootageConfig(start=start), recorder())
         assert shot.solve.is_dir() and json.loads(shot.listing.read_text()) == before
-    import_footage(shot, str(source), FootageConfig(start=own + 1), recorder())
+    import_footage(shot, str(source), FootageConfig(start=file_numbers + 1), recorder())
     assert not shot.solve.exists()
 
 
@@ -93,7 +91,7 @@ def test_gaps_of_a_sequence_stay_gaps(tmp_path, pictures, recorder):
     assert np.abs(plates.display(110).numpy() - pictures[11].astype(np.float32) / 255).max() < 0.02
 
 
-def test_a_cut_is_told_in_the_numbers_that_the_range_has_to_be_in(tmp_path, pan, write_video, recorder):
+def test_cut_is_reported_in_footage_numbers(tmp_path, pan, write_video, recorder):
     write_video(tmp_path / "clip.mp4", pan(12, seed=1) + pan(16, seed=2))
     shot = Shot.create(tmp_path / "a.splannequin")
     with pytest.raises(JobError) as refused:
@@ -103,7 +101,7 @@ def test_a_cut_is_told_in_the_numbers_that_the_range_has_to_be_in(tmp_path, pan,
     assert shot.info().first == 1001 and shot.info().last == 1016
 
 
-def test_the_footages_own_alpha_is_that_of_the_same_frame(tmp_path, pictures, recorder):
+def test_footage_alpha_belongs_to_the_same_frame(tmp_path, pictures, recorder):
     folder = tmp_path / "clip"
     folder.mkdir()
     for n, pixels in enumerate(pictures, 1):

@@ -59,7 +59,7 @@ def converted(pixels, space, target, config=BUILT_IN):
     return np.asarray(out.get_pixels(oiio.FLOAT))
 
 
-def off(found, expected):
+def relative_error(found, expected):
     """Largest error of a pixel, relative to its brightest channel."""
     return float((np.abs(found - expected).max(-1) / np.abs(expected).max(-1)).max())
 
@@ -85,13 +85,13 @@ LOGS = ["ARRI LogC3 (EI800)", "ARRI LogC4", "S-Log3 S-Gamut3", "V-Log V-Gamut", 
 
 
 @pytest.mark.parametrize("space", ["ACEScg", "ACES2065-1", "Linear Rec.2020", *LOGS])
-def test_light_goes_there_and_comes_back(space):
+def test_linear_light_round_trips(space):
     """OpenImageIO encodes light of 0.001 to 50 and -0.01; our decoding agrees with the light and with OpenImageIO's
     decoding."""
     codes = converted(swatches(), "lin_rec709_scene", space)
     found = light_of(codes, space, BUILT_IN)
-    assert off(found, swatches()) < 1e-3
-    assert off(found, converted(codes, space, "lin_rec709_scene")) < 1e-5
+    assert relative_error(found, swatches()) < 1e-3
+    assert relative_error(found, converted(codes, space, "lin_rec709_scene")) < 1e-5
     assert found[0, 0] == pytest.approx(-0.01, rel=1e-3)
 
 
@@ -99,7 +99,7 @@ def test_light_goes_there_and_comes_back(space):
 def test_a_film_scan_comes_back_from_black_on(space):
     """Film densities cannot encode light below black."""
     codes = converted(swatches()[:, 1:].copy(), "lin_rec709_scene", space)
-    assert off(light_of(codes, space, BUILT_IN), swatches()[:, 1:]) < 1e-3
+    assert relative_error(light_of(codes, space, BUILT_IN), swatches()[:, 1:]) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_film_scan_comes_back_from_black_on(space):
 def test_our_hdr_curves_are_ocios_but_for_what_white_is(ours, theirs):
     codes = np.random.default_rng(1).uniform(0.05, 0.95, (9, 11, 3)).astype(np.float32)
     space = InputSpace("pq" if "PQ" in theirs else "hlg", "rec2020")
-    assert off(space.to_linear(codes) * 2.03, light_of(codes, theirs, BUILT_IN)) < 1e-3
+    assert relative_error(space.to_linear(codes) * 2.03, light_of(codes, theirs, BUILT_IN)) < 1e-3
     grey = np.full((1, 1, 3), 0.5, np.float32)
     assert ours(grey)[0, 0] * 2.03 == pytest.approx(light_of(grey, theirs, BUILT_IN)[0, 0], rel=1e-4)
 
@@ -123,7 +123,7 @@ def test_a_sequence_in_a_named_space_is_what_oiiotool_makes_of_it(tmp_path):
     subprocess.run(command, check=True)
     expected = np.asarray(oiio.ImageBuf(str(tmp_path / "light.exr")).get_pixels(oiio.FLOAT))
     found, source = read(folder, "s-log3 s-gamut3")
-    assert off(found, expected) < 1e-3 and off(found, swatches()) < 1e-3
+    assert relative_error(found, expected) < 1e-3 and relative_error(found, swatches()) < 1e-3
     list(source.frames(None, None))
     assert [message for message, _ in source.warnings] == [
         "The pictures are S-Log3 S-Gamut3 (OCIO): converted to Rec.709."
@@ -132,22 +132,22 @@ def test_a_sequence_in_a_named_space_is_what_oiiotool_makes_of_it(tmp_path):
     assert (reading["colour"], reading["colour_told"], reading["ocio"]) == ("S-Log3 S-Gamut3 (OCIO)", True, BUILT_IN)
 
 
-@pytest.mark.parametrize("told", ["ARRI LogC3 (EI800)", "ocio:arrilogc3_awg3_scene", "arri_logc3_ei800"])
-def test_a_name_in_the_file_is_looked_up_in_the_configuration(tmp_path, told):
+@pytest.mark.parametrize("named_by_user", ["ARRI LogC3 (EI800)", "ocio:arrilogc3_awg3_scene", "arri_logc3_ei800"])
+def test_a_name_in_the_file_is_looked_up_in_the_configuration(tmp_path, named_by_user):
     codes = converted(swatches(), "lin_rec709_scene", "ARRI LogC3 (EI800)")
-    found, source = read(written(tmp_path / "plate", codes, colorInteropID=told))
-    assert off(found, swatches()) < 1e-3 and source.info.reading["colour"] == "ARRI LogC3 (EI800) (OCIO)"
+    found, source = read(written(tmp_path / "plate", codes, colorInteropID=named_by_user))
+    assert relative_error(found, swatches()) < 1e-3 and source.info.reading["colour"] == "ARRI LogC3 (EI800) (OCIO)"
 
 
 def test_a_chosen_space_outdoes_what_the_file_says(tmp_path):
     folder = written(
         tmp_path / "plate", converted(swatches(), "lin_rec709_scene", "ACEScg"), colorInteropID="lin_rec709_scene"
     )
-    assert off(read(folder)[0], swatches()) > 0.05
-    assert off(read(folder, "ACEScg")[0], swatches()) < 1e-3
+    assert relative_error(read(folder)[0], swatches()) > 0.05
+    assert relative_error(read(folder, "ACEScg")[0], swatches()) < 1e-3
 
 
-def test_srgb_stays_as_it_stands_to_the_bit():
+def test_srgb_is_bit_identical():
     assert Colours("sRGB - Display").space() == InputSpace("srgb")
     assert Colours("cineon").space() == InputSpace("cineon"), "what only we name is known, too"
 
@@ -222,5 +222,5 @@ def test_an_ocio_space_is_light():
     space = OcioSpace("lin", "", space="ACEScg", config=BUILT_IN)
     assert space.is_light and not space.is_passthrough
     ap1 = np.array([[[0.3, 0.25, 0.2]]], np.float32)
-    assert off(space.to_linear(ap1), InputSpace("lin", "ap1").to_linear(ap1)) < 1e-4
+    assert relative_error(space.to_linear(ap1), InputSpace("lin", "ap1").to_linear(ap1)) < 1e-4
     assert PRIMARIES["ap1"][0] == "ACEScg (AP1)"

@@ -68,9 +68,7 @@ def test_a_video_is_shown_by_its_display_matrix_when_read_and_when_read_again(tm
 
 
 @pytest.mark.parametrize("matrix", [(COS, SIN, -SIN, COS), (0, 2, -1, 0), (1, 0.5, 0, 1), (0, 0, 0, 0)])
-def test_a_matrix_that_is_none_of_the_eight_is_told_and_shows_the_picture_as_it_is_stored(
-    tmp_path, pan, write_video, matrix
-):
+def test_unsupported_display_matrix_is_reported_and_ignored(tmp_path, pan, write_video, matrix):
     frames = pan(8)
     write_video(tmp_path / "a.mp4", frames)
     set_matrix(tmp_path / "a.mp4", *matrix)
@@ -129,10 +127,12 @@ def test_pictures_are_shown_by_their_exif_orientation(tmp_path, pan, code, suffi
     assert bool(source.info.mismatch) == (code != 1)
 
 
-@pytest.mark.parametrize(("other", "words"), [(3, "turned by 180 degrees"), (6, "turned clockwise"), (2, "mirrored")])
-def test_pictures_that_differ_in_orientation_are_refused(tmp_path, pan, other, words):
+@pytest.mark.parametrize(
+    ("second_orientation", "words"), [(3, "turned by 180 degrees"), (6, "turned clockwise"), (2, "mirrored")]
+)
+def test_pictures_that_differ_in_orientation_are_refused(tmp_path, pan, second_orientation, words):
     """The headers cannot tell whether the pixels or the orientation tags of such a sequence are consistent."""
-    write_pictures(tmp_path / "a", pan(4), [1, 1, other, other])
+    write_pictures(tmp_path / "a", pan(4), [1, 1, second_orientation, second_orientation])
     with pytest.raises(JobError) as caught:
         list(open_source(str(tmp_path / "a")).frames(None, None))
     assert "f_0003.png" in caught.value.message and words in caught.value.message

@@ -47,12 +47,12 @@ def test_how_pictures_are_counted(pictures, frames, clip, shift, step, needs_all
     assert step == 0 or f"picture {frames[0] - step} is used for frame {frames[0]}," in said[0]
 
 
-def test_a_second_way_that_fits_as_well_is_told():
+def test_ambiguous_pairing_is_reported():
     assert pairing_words("The mask", [0], pair(range(0, 101), Counted(list(range(1, 101)), (1, 100)))) is not None
     assert pairing_words("The mask", [0], pair(range(1, 101), Counted(list(range(1, 101)), (1, 100)))) is None
 
 
-def test_cameras_that_are_missing_here_and_there_move_no_other():
+def test_missing_cameras_do_not_shift_others():
     frames = list(range(1, 101))
     for lost in ({3, 50}, {98, 99}, set(range(1, 100, 2)), {*range(40, 90)}):
         kept = [n for n in range(100) if n not in lost]
@@ -66,7 +66,7 @@ def test_a_mask_that_lacks_a_picture_in_the_middle_is_not_pushed_together():
 
 
 @pytest.mark.parametrize("needs_all", [True, False])
-def test_numbers_that_are_right_for_most_frames_are_not_pushed_onto_the_others(needs_all):
+def test_numbering_of_most_frames_is_not_forced_on_all(needs_all):
     paired = pair(range(101, 121), Counted(list(range(105, 125))), needs_all)
     assert step_of(paired) == 0 and list(paired.numbers) == list(range(105, 121))
 

@@ -20,7 +20,7 @@ from torch_backend.lens.undistort import Undistorter, of_frames
 from torch_backend.shot import Shot, write_json
 
 
-def solved(shot, radial=0.0, **told):
+def solved(shot, radial=0.0, **facts):
     """Write a solve with one radial lens for `shot`, and undistort its frames as the solve does."""
     record = load_frames(shot)
     width, height = record["width"], record["height"]
@@ -30,8 +30,8 @@ def solved(shot, radial=0.0, **told):
     shot.solve.mkdir(exist_ok=True)
     write_json(shot.solve / "cameras.json", CameraPath(width, height, cameras).to_json())
     record_of_solve = {"version": 1, "key": f"k{radial}", "camera_model": "SIMPLE_RADIAL", "distortion": [radial]}
-    write_json(shot.solve / "solve.json", {**record_of_solve, "focal_px": float(width), **told})
-    if "camera_model" not in told:
+    write_json(shot.solve / "solve.json", {**record_of_solve, "focal_px": float(width), **facts})
+    if "camera_model" not in facts:
         where = load_plate_lenses(shot)[cameras[0].frame].where(width, height)
         undistort = of_frames(Undistorter(where), where, display_of(record))
         for row in record["frames"]:
@@ -83,7 +83,7 @@ def test_a_clip_of_the_working_size_is_the_undistorted_frames(tmp_path, shot_of,
     assert half.display(3).shape == (24, 32, 3) and half.key != plates.key
 
 
-def test_a_larger_clip_is_read_at_its_own_size(tmp_path, shot_of, pan, write_video):
+def test_larger_clip_is_read_at_full_size(tmp_path, shot_of, pan, write_video):
     frames = pan(12, height=96, width=128)
     write_video(tmp_path / "a.mp4", frames)
     shot = shot_of(tmp_path / "a.mp4", working_height=48, first=3)
@@ -184,8 +184,8 @@ def at_random(numbers):
 
 
 def as_frozen(numbers):
-    asked = (m for n in numbers for m in (n, n - 2, n + 2, n - 4, n + 4, numbers[len(numbers) // 2]))
-    return [m for m in asked if m in numbers]
+    requested = (m for n in numbers for m in (n, n - 2, n + 2, n - 4, n + 4, numbers[len(numbers) // 2]))
+    return [m for m in requested if m in numbers]
 
 
 VIDEOS = {
@@ -246,7 +246,7 @@ def test_footage_that_is_gone_is_said_and_the_working_frames_serve(tmp_path, pan
     assert (plates.display(4).numpy() == working_of(shot, 4)).all()
 
 
-def test_moved_and_copied_footage_is_found_other_footage_is_refused(tmp_path, pan, write_video, shot_of):
+def test_moved_footage_is_found_and_different_footage_refused(tmp_path, pan, write_video, shot_of):
     clip = tmp_path / "clips" / "a.mp4"
     clip.parent.mkdir()
     write_video(clip, pan(10, height=96, width=128))
@@ -270,15 +270,15 @@ def test_an_import_whose_chroma_was_scaled_up_otherwise_is_known_again(tmp_path,
     clip = tmp_path / "a.mp4"
     write_video(clip, [np.ascontiguousarray(wide[:, 3 * n : 3 * n + 96]) for n in range(9)])
     shot = shot_of(clip, working_height=32)
-    off = 0.0
+    largest = 0.0
     for file in sorted(shot.raw.iterdir()):
         picture = read_png(file).astype(np.float32)
         luma = (picture @ np.array([0.2126, 0.7152, 0.0722], np.float32))[..., None]
         chroma = picture - luma
-        other = np.clip(np.rint(luma + 0.5 * (chroma + np.roll(chroma, 1, axis=1))), 0, 255).astype(np.uint8)
-        off = max(off, float(np.abs(other - picture).max()))
-        write_png(file, other)
-    assert off > 12.0, "else nothing differs"
+        blended = np.clip(np.rint(luma + 0.5 * (chroma + np.roll(chroma, 1, axis=1))), 0, 255).astype(np.uint8)
+        largest = max(largest, float(np.abs(blended - picture).max()))
+        write_png(file, blended)
+    assert largest > 12.0, "else nothing differs"
     write_json(shot.listing, {**read_json(shot.listing), "key": "of an earlier version"})
     assert Plates(shot).note == ""
     files = sorted(shot.raw.iterdir())
@@ -297,7 +297,7 @@ def test_a_file_that_breaks_meanwhile_is_named(tmp_path, shot_of):
         plates.display(1005)
 
 
-def test_a_lens_that_is_not_told_is_said(tmp_path, pan, write_video, shot_of):
+def test_missing_lens_is_reported(tmp_path, pan, write_video, shot_of):
     write_video(tmp_path / "a.mp4", pan(10, height=96, width=128))
     shot = shot_of(tmp_path / "a.mp4", working_height=48)
     solved(shot, camera_model="OPENCV_FISHEYE", distortion=[0.1, 0.0, 0.0, 0.0])
@@ -305,7 +305,7 @@ def test_a_lens_that_is_not_told_is_said(tmp_path, pan, write_video, shot_of):
     assert plates.width == 64 and "OPENCV_FISHEYE" in plates.note
 
 
-def test_no_more_plates_are_held_than_asked_and_the_last_ones_stay(tmp_path, pan, write_video, shot_of):
+def test_plate_cache_is_bounded_and_keeps_recent_plates(tmp_path, pan, write_video, shot_of):
     write_video(tmp_path / "a.mp4", pan(20, height=96, width=128))
     shot = shot_of(tmp_path / "a.mp4", working_height=48)
     plates = Plates(shot, keep=3)

@@ -113,12 +113,12 @@ def shades_of(source):
     ["frame-{:04d}.png", "2026-11-28-{:04d}.png", "clip_v02-{:04d}.png", "photo ({}).png", "f_{:04d}_left.png"],
 )
 @pytest.mark.parametrize("how", ["folder", "file", "pattern"])
-def test_frames_come_in_their_order_whatever_stands_around_the_number(tmp_path, template, how):
+def test_frames_are_ordered_by_number_for_any_name_pattern(tmp_path, template, how):
     folder = tmp_path / "#1 [a]{b}+(c) 50%"
     write_shades(folder, [template.format(n) for n in range(5, 15)])
     pattern = template.replace("{:04d}", "####").replace("{}", "#")
-    asked = {"folder": folder, "file": folder / template.format(9), "pattern": folder / pattern}[how]
-    source = open_source(str(asked))
+    path = {"folder": folder, "file": folder / template.format(9), "pattern": folder / pattern}[how]
+    source = open_source(str(path))
     assert shades_of(source) == [(n + 5, n) for n in range(10)]
     assert (source.info.reading["files"], source.warnings, source.info.mismatch) == (pattern, [], "")
 
@@ -155,7 +155,7 @@ def test_two_sequences_are_named_and_either_can_be_chosen(tmp_path, first, secon
         assert shades_of(open_source(str(tmp_path / chosen))) == [(n, n + 8) for n in range(8)]
 
 
-def test_a_second_number_that_varies_is_told_and_keeps_the_plate_out_of_blender(tmp_path):
+def test_second_varying_number_is_reported_and_blocks_the_plate(tmp_path):
     write_shades(tmp_path, [f"f_{n:04d}_t{n * 41}.png" for n in range(1, 9)])
     source = open_source(str(tmp_path))
     assert shades_of(source) == [(n + 1, n) for n in range(8)]
@@ -164,9 +164,9 @@ def test_a_second_number_that_varies_is_told_and_keeps_the_plate_out_of_blender(
 
 def test_numbers_of_which_either_may_count_the_frames_are_refused(tmp_path):
     write_shades(tmp_path, [f"a{n}_b{10 - n}.png" for n in range(1, 10)])
-    for asked in (tmp_path, tmp_path / "a3_b7.png"):
+    for path in (tmp_path, tmp_path / "a3_b7.png"):
         with pytest.raises(JobError, match=r"2 image sequences \(a#_b\*\.png, a\*_b#\.png\)"):
-            open_source(str(asked))
+            open_source(str(path))
     assert shades_of(open_source(str(tmp_path / "a*_b#.png")))[0] == (1, 8)
 
 
@@ -181,11 +181,11 @@ def test_whatever_openimageio_reads_is_a_sequence(tmp_path, pan, suffix):
     pictures = pan(3)
     for n, pixels in enumerate(pictures):
         write(tmp_path / f"f.{n}.{suffix}", pixels)
-    for asked in (tmp_path, tmp_path / f"f.1.{suffix}"):
-        frames = list(open_source(str(asked)).frames(None, None))
+    for path in (tmp_path, tmp_path / f"f.1.{suffix}"):
+        frames = list(open_source(str(path)).frames(None, None))
         assert [f.number for f in frames] == [0, 1, 2]
-        off = [np.abs(f.pixels.astype(int) - pixels).mean() for f, pixels in zip(frames, pictures)]
-        assert max(off) < 3
+        errors = [np.abs(f.pixels.astype(int) - pixels).mean() for f, pixels in zip(frames, pictures)]
+        assert max(errors) < 3
     assert bool(open_source(str(tmp_path)).info.mismatch) == (suffix != "webp")
 
 
@@ -197,15 +197,15 @@ def test_pictures_that_are_not_read_are_named_with_what_to_do(tmp_path, pan):
     for n in range(1, 10):
         (tmp_path / f"f_{n:04d}.qoi").write_bytes(picture)
         (tmp_path / f"raw-{n:04d}.dng").write_bytes(b"II*\0not a picture that FFmpeg opens")
-    for asked, pattern in (("f_0004.qoi", "f_####.qoi"), ("raw-0004.dng", "raw-####.dng"), ("", "f_####.qoi")):
+    for path, pattern in (("f_0004.qoi", "f_####.qoi"), ("raw-0004.dng", "raw-####.dng"), ("", "f_####.qoi")):
         with pytest.raises(JobError) as error:
-            open_source(str(tmp_path / asked))
+            open_source(str(tmp_path / path))
         assert error.value.message.startswith(f"{pattern} cannot be read") and "PNG" in error.value.hint
-    alone = tmp_path / "alone"
-    alone.mkdir()
-    (alone / "f.qoi").write_bytes(picture)
+    folder = tmp_path / "alone"
+    folder.mkdir()
+    (folder / "f.qoi").write_bytes(picture)
     with pytest.raises(JobError, match=r"f\.qoi is a single picture"):
-        open_source(str(alone / "f.qoi"))
+        open_source(str(folder / "f.qoi"))
 
 
 def test_a_damaged_video_among_numbered_ones_is_not_called_a_picture(tmp_path, pan, write_video):
@@ -381,7 +381,7 @@ def test_passes_without_a_picture_are_refused(tmp_path):
         open_source(str(tmp_path))
 
 
-def test_a_file_with_the_layer_elsewhere_is_read_there_and_one_without_it_refused(tmp_path):
+def test_layer_is_found_in_any_part_or_refused(tmp_path):
     names = ("rgba.R", "rgba.G", "rgba.B", "spec.R", "spec.G", "spec.B")
     write(tmp_path / "a.0.exr", flat(0.3, 0.2, 0.1, 0.9, 0.9, 0.9), names=names)
     write(tmp_path / "a.1.exr", flat(0.9, 0.9, 0.9, 0.3, 0.2, 0.1), names=names[3:] + names[:3])
@@ -426,7 +426,7 @@ def test_opaque_pictures_say_nothing_of_alpha(tmp_path):
 
 
 @pytest.mark.parametrize(("aspect", "size"), [(2.0, (16, 8)), (0.5, (8, 16))])
-def test_pixels_that_are_not_square_become_so(tmp_path, aspect, size):
+def test_non_square_pixels_are_resampled(tmp_path, aspect, size):
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", flat(0.3, 0.2, 0.1), PixelAspectRatio=aspect)
     source, pixel = first_of(tmp_path)
@@ -436,7 +436,7 @@ def test_pixels_that_are_not_square_become_so(tmp_path, aspect, size):
     assert said(source)[0].startswith(f"The pictures have pixels {aspect:g} times as wide as high: 8x8 becomes")
 
 
-def test_a_crop_window_is_told(tmp_path):
+def test_crop_window_is_reported(tmp_path):
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", flat(1.0, 1.0, 1.0, 1.0), window=(-2, 3), full=(0, 0, 20, 20))
     source, _ = first_of(tmp_path)

@@ -62,13 +62,13 @@ def test_rec709_light_needs_no_words_and_what_was_assumed_is_recorded(tmp_path):
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", flat(0.3, 0.2, 0.1))
         write(tmp_path / f"b.{i}.exr", flat(0.3, 0.2, 0.1), chromaticities=values)
-    for name, told in (("a.0.exr", False), ("b.0.exr", True)):
+    for name, is_named in (("a.0.exr", False), ("b.0.exr", True)):
         source, pixel = first_of(tmp_path / name)
         assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=5e-5)
-        assert (said(source), source.info.reading["colour_told"]) == ([], told)
+        assert (said(source), source.info.reading["colour_told"]) == ([], is_named)
 
 
-def test_impossible_chromaticities_are_told(tmp_path):
+def test_impossible_chromaticities_are_reported(tmp_path):
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", flat(0.3, 0.2, 0.1), chromaticities=(0.0,) * 8)
     source, pixel = first_of(tmp_path)
@@ -99,7 +99,7 @@ def profile(name):
 
 
 @pytest.mark.parametrize(("name", "words"), [("Display P3", True), ("sRGB IEC61966-2.1", False)])
-def test_a_colour_profile_that_is_not_applied_is_told(tmp_path, name, words):
+def test_unapplied_colour_profile_is_reported(tmp_path, name, words):
     content = np.frombuffer(profile(name), np.uint8)
     pixels = flat(200, 100, 50, kind=np.uint8)
     for i in range(3):
@@ -107,8 +107,8 @@ def test_a_colour_profile_that_is_not_applied_is_told(tmp_path, name, words):
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{content.size}]"), content)
         out = oiio.ImageOutput.create(str(tmp_path / f"a.{i}.png"))
         assert out.open(str(tmp_path / f"a.{i}.png"), spec) and out.write_image(pixels) and out.close()
-    told = [f"The pictures carry the colour profile {name!r}, which is not applied."]
-    assert said(first_of(tmp_path)[0]) == (told if words else [])
+    warnings = [f"The pictures carry the colour profile {name!r}, which is not applied."]
+    assert said(first_of(tmp_path)[0]) == (warnings if words else [])
 
 
 def write_cineon(path, codes):
@@ -134,7 +134,7 @@ def test_cineon_files_are_read_as_film_log(tmp_path):
     assert said(source)[0].startswith("The pictures are Cineon log")
 
 
-def test_a_dpx_that_does_not_say_what_it_is_is_told(tmp_path):
+def test_unspecified_dpx_is_reported(tmp_path):
     for i in range(3):
         write(tmp_path / f"a.{i}.dpx", flat(30000, 20000, 10000, kind=np.uint16))
         write(tmp_path / f"b.{i}.dpx", flat(30000, 20000, 10000, kind=np.uint16), dpx__Transfer="SMPTE 274M")

@@ -91,12 +91,12 @@ def with_timecode(tmp_path, pan):
 @pytest.mark.parametrize("suffix", ["exr", "dpx"])
 def test_pictures_carry_it_and_a_range_begins_later(tmp_path, with_timecode, recorder, suffix):
     shot = Shot.create(tmp_path / "a.splannequin")
-    told = import_footage(shot, str(with_timecode(suffix)), FootageConfig(first=1003, step=1), recorder())
+    record = import_footage(shot, str(with_timecode(suffix)), FootageConfig(first=1003, step=1), recorder())
     assert load_frames(shot)["timecode"] == "10:00:00:02"
-    assert ", timecode 10:00:00:02." in told["read_as"][0]
+    assert ", timecode 10:00:00:02." in record["read_as"][0]
 
 
 def test_footage_without_one_has_none(tmp_path, with_timecode, recorder):
     shot = Shot.create(tmp_path / "a.splannequin")
-    told = import_footage(shot, str(with_timecode(code="")), FootageConfig(step=1), recorder())
-    assert load_frames(shot)["timecode"] == "" and "timecode" not in told["read_as"][0]
+    record = import_footage(shot, str(with_timecode(code="")), FootageConfig(step=1), recorder())
+    assert load_frames(shot)["timecode"] == "" and "timecode" not in record["read_as"][0]

@@ -100,7 +100,7 @@ def interlaced(tmp_path, frame_of_planes):
 
 
 @pytest.mark.parametrize("top_first", [True, False])
-def test_interlaced_clips_become_whole_pictures_and_say_so(interlaced, top_first):
+def test_interlaced_clips_are_deinterlaced_and_reported(interlaced, top_first):
     path, firsts = interlaced(top_first)
     source, got = decoded(path)
     assert [f.number for f in got] == list(range(1, 13))
@@ -125,7 +125,7 @@ def woven(frames, top_first=True):
 
 
 @pytest.mark.parametrize("top_first", [True, False])
-def test_a_clip_that_is_interlaced_without_saying_so_becomes_whole_pictures(tmp_path, pan, write_video, top_first):
+def test_unmarked_interlaced_clip_is_deinterlaced(tmp_path, pan, write_video, top_first):
     frames = pan(40, 96, 128, speed=3)
     write_video(tmp_path / "a.mp4", woven(frames, top_first))
     source, got = decoded(tmp_path / "a.mp4")
@@ -133,8 +133,8 @@ def test_a_clip_that_is_interlaced_without_saying_so_becomes_whole_pictures(tmp_
         "The clip is interlaced, though it does not say so: each frame is built from its first field."
     ]
     assert source.info.reading["interlaced"] and source.info.mismatch.startswith("it is interlaced")
-    off = [np.abs(one.pixels.astype(int) - first)[4:-4].mean() for one, first in zip(got, frames[::2], strict=True)]
-    assert max(off) < 1.0, max(off)
+    errors = [np.abs(one.pixels.astype(int) - first)[4:-4].mean() for one, first in zip(got, frames[::2], strict=True)]
+    assert max(errors) < 1.0, max(errors)
     reader = source.plates(Known({f.number: f.seconds for f in got}, 0.0, lambda number, plate: True))
     assert (reader.plate(9) == got[8].pixels).all()
     reader.close()
@@ -196,8 +196,8 @@ def test_damaged_packets_are_skipped_with_a_warning_and_keep_their_numbers(tmp_p
 
 
 @pytest.fixture
-def broken_off(tmp_path, pan, write_video):
-    """broken_off(suffix, share): the first part of a clip of 24 frames whose header is at the beginning of the file."""
+def truncated_clip(tmp_path, pan, write_video):
+    """truncated_clip(suffix, share): first part of a clip of 24 frames with the header at the beginning of the file."""
 
     def make(suffix, share):
         whole = tmp_path / f"whole.{suffix}"
@@ -212,25 +212,25 @@ def broken_off(tmp_path, pan, write_video):
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
-def test_a_file_that_breaks_off_says_how_much_of_it_there_is(broken_off, suffix):
-    source, got = decoded(broken_off(suffix, 0.75))
+def test_truncated_file_reports_its_readable_part(truncated_clip, suffix):
+    source, got = decoded(truncated_clip(suffix, 0.75))
     assert 12 <= len(got) < 24
     assert [f.number for f in got] == list(range(1, len(got) + 1))
     assert [w[0] for w in source.warnings] == [
         f"broken.{suffix} ends after frame {len(got)}, but its header announces 24."
     ]
-    asked, got = decoded(broken_off(suffix, 0.75), 2, 10)  # the range ends before the break: no warning
-    assert ([f.number for f in got], asked.warnings) == (list(range(2, 11)), [])
+    opened, got = decoded(truncated_clip(suffix, 0.75), 2, 10)  # the range ends before the break: no warning
+    assert ([f.number for f in got], opened.warnings) == (list(range(2, 11)), [])
 
 
 @pytest.mark.parametrize(("suffix", "share"), [("mp4", 0.6), ("mov", 0.45), ("mkv", 0.45)])
-def test_less_than_half_of_a_file_is_refused(broken_off, suffix, share):
+def test_less_than_half_of_a_file_is_refused(truncated_clip, suffix, share):
     with pytest.raises(JobError, match=r"ends after frame \d+, but its header announces 24\.") as error:
-        decoded(broken_off(suffix, share))
+        decoded(truncated_clip(suffix, share))
     assert error.value.exit_code == ExitCode.FOOTAGE
 
 
-def test_a_clip_that_changes_its_size_ends_there_and_says_so(tmp_path, pan, write_video):
+def test_clip_ends_at_a_size_change_with_a_warning(tmp_path, pan, write_video):
     """Motion JPEG stores the size in every picture."""
     write_video(tmp_path / "a.mkv", pan(12), codec="mjpeg", pix_fmt="yuvj444p")
     write_video(tmp_path / "b.mkv", pan(12, height=64, width=48), codec="mjpeg", pix_fmt="yuvj444p")
@@ -298,7 +298,7 @@ def test_pixels_that_no_lens_makes_are_taken_as_square(tmp_path, pan, write_vide
     assert source.warnings[0][0] == "The footage claims pixels 5 times as wide as high: read as square."
 
 
-def test_sound_alone_is_no_video(tmp_path):
+def test_audio_only_file_is_refused(tmp_path):
     with av.open(str(tmp_path / "a.wav"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
@@ -309,19 +309,19 @@ def test_sound_alone_is_no_video(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["index missing", "copy broken off", "never closed", "zeros behind"])
-def test_a_recording_that_was_not_finished_is_told_so(tmp_path, pan, write_video, how):
+def test_unfinished_recording_is_reported(tmp_path, pan, write_video, how):
     """MP4 and QuickTime store their index at the end."""
     write_video(tmp_path / "a.mp4", pan(8))
     data = (tmp_path / "a.mp4").read_bytes()
     at = data.index(b"moov") - 4
     mdat = data.index(b"mdat") - 4
-    made = {
+    cases = {
         "index missing": data[:at],
         "copy broken off": data[: at - 100],
         "never closed": data[:mdat] + bytes(4) + data[mdat + 4 : at - 7],
         "zeros behind": data[:at] + bytes(4096),
     }[how]
-    (tmp_path / "a.mov").write_bytes(made)
+    (tmp_path / "a.mov").write_bytes(cases)
     with pytest.raises(JobError, match=r"a.mov was not finished: its index \(the moov atom\) is missing") as caught:
         open_source(str(tmp_path / "a.mov"))
     assert caught.value.exit_code == ExitCode.FOOTAGE
@@ -343,7 +343,7 @@ def two_streams(tmp_path, pan):
     return tmp_path / "a.mov", [video[0] for video in videos]
 
 
-def test_which_of_two_streams_is_read_is_said_and_the_other_can_be_named(two_streams):
+def test_chosen_video_stream_is_reported_and_selectable(two_streams):
     path, firsts = two_streams
     source, got = decoded(path)
     assert source.warnings == [
@@ -353,10 +353,10 @@ def test_which_of_two_streams_is_read_is_said_and_the_other_can_be_named(two_str
         )
     ]
     assert close(got[0].pixels, firsts[0], 2) and not source.info.mismatch
-    other = open_source(str(path), layer="2")
-    assert close(next(other.frames(None, None)).pixels, firsts[1], 2) and not other.warnings
-    reader = other.plates(Known({n: (n - 1) / 24 for n in range(1, 9)}, 0.0, lambda *_: True))
-    assert close(reader.plate(1), firsts[1], 2) and "several video streams" in other.info.mismatch
+    second_stream = open_source(str(path), layer="2")
+    assert close(next(second_stream.frames(None, None)).pixels, firsts[1], 2) and not second_stream.warnings
+    reader = second_stream.plates(Known({n: (n - 1) / 24 for n in range(1, 9)}, 0.0, lambda *_: True))
+    assert close(reader.plate(1), firsts[1], 2) and "several video streams" in second_stream.info.mismatch
     reader.close()
     with pytest.raises(JobError, match="a.mov has no video stream '3'"):
         open_source(str(path), layer="3")

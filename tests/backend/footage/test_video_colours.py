@@ -124,7 +124,7 @@ def test_wide_linear_and_hdr_video_becomes_rec709(write_patches, name):
     assert source.info.reading["colour_told"] and source.info.reading["matrix_told"]
 
 
-def test_rec709_video_is_taken_as_it_stands_without_words(write_patches):
+def test_rec709_video_is_read_unchanged_without_warnings(write_patches):
     source, got = write_patches(1, 1, 1)
     assert np.abs(got - PATCHES).max() < 1.2 / 255
     assert (source.warnings, source.info.colour, len(source.info.key)) == ([], "srgb", 3)
@@ -136,7 +136,7 @@ def test_hdr_highlights_are_kept(write_patches):
     assert pq_light(0.9) > 15 and srgb_light(got[0]) == pytest.approx(pq_light(0.9), rel=1e-2)
 
 
-def test_a_transfer_function_that_is_not_known_is_told(write_patches):
+def test_unknown_transfer_function_is_reported(write_patches):
     source, _ = write_patches(9, 1, 1)
     assert source.warnings[0][0] == (
         "The clip's transfer function (number 9 of ITU-T H.273) is unknown: read as video."
@@ -145,7 +145,7 @@ def test_a_transfer_function_that_is_not_known_is_told(write_patches):
 
 
 @pytest.mark.parametrize(
-    "size, tags, told, unlike",
+    "size, tags, choices, reason",
     [
         ((48, 64), {}, {}, ""),
         ((16, 1280), {}, {}, "it does not state its colour matrix"),
@@ -155,11 +155,11 @@ def test_a_transfer_function_that_is_not_known_is_told(write_patches):
         ((48, 64), {"aspect": Fraction(2)}, {}, "its pixels are not square"),
     ],
 )
-def test_what_other_programs_would_show_otherwise_is_known(tmp_path, write_video, size, tags, told, unlike):
+def test_footage_that_blender_decodes_differently_is_marked(tmp_path, write_video, size, tags, choices, reason):
     """FFmpeg, and therefore Blender, decodes clips without a matrix as BT.601 at any size."""
-    made = {name: tags[name] for name in ("rotation", "aspect") if name in tags}
+    options = {name: tags[name] for name in ("rotation", "aspect") if name in tags}
     frames = [np.full((*size, 3), 60, np.uint8)] * 3
     write_video(
-        tmp_path / "a.mp4", frames, **made, **({"x264-params": "colormatrix=bt709"} if "colorspace" in tags else {})
+        tmp_path / "a.mp4", frames, **options, **({"x264-params": "colormatrix=bt709"} if "colorspace" in tags else {})
     )
-    assert open_source(str(tmp_path / "a.mp4"), overrides=Overrides(**told)).info.mismatch == unlike
+    assert open_source(str(tmp_path / "a.mp4"), overrides=Overrides(**choices)).info.mismatch == reason

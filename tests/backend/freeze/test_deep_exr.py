@@ -20,7 +20,7 @@ def samples_of(path):
     return np.array([*each, None], dtype=object)[:-1].reshape(spec.height, spec.width), spec
 
 
-def test_a_deep_file_that_is_cut_off_is_no_whole_picture(tmp_path):
+def test_truncated_deep_file_is_incomplete(tmp_path):
     rng = np.random.default_rng(1)
     rgba, depth = rng.random((2, 70, 20, 4)).astype(np.float32), rng.random((2, 70, 20)).astype(np.float32)
     rgba[1, 10:30, :, 3] = 0.0

@@ -72,32 +72,32 @@ def detail_of(stored: dict, seed: int = 2) -> DetailLayers:
     return DetailLayers(stored["rgba"][:, ::-1] * 0.5, rng.uniform(size=shape).astype(np.float32), source)
 
 
-def made(array):
+def source(array):
     return LazyLayer(array.shape, lambda rows: array[rows].astype(np.float64))
 
 
-def test_layers_made_while_they_are_written_give_the_same_file(tmp_path):
+def test_streamed_layers_give_the_same_file(tmp_path):
     stored = layers(150, 60)
     detail, grain = detail_of(stored), np.random.default_rng(3).normal(size=(150, 60, 3)).astype(np.float32)
     whole = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, grain=grain, detail=detail, **stored)
-    lazy = {name: made(array) for name, array in stored.items()}
-    told = dataclasses.replace(detail, splat=made(detail.splat))
-    parts = write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, grain=made(grain), detail=told, **lazy)
+    lazy = {name: source(array) for name, array in stored.items()}
+    deferred = dataclasses.replace(detail, splat=source(detail.splat))
+    parts = write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, grain=source(grain), detail=deferred, **lazy)
     a, b = (oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT) for path in (whole, parts))
     np.testing.assert_array_equal(a, b)
 
 
-def test_a_wrong_layer_made_while_it_is_written_leaves_no_file(tmp_path):
+def test_invalid_streamed_layer_leaves_no_file(tmp_path):
     stored = layers(150, 60)
     stored["depth"][130, 7] = np.nan
     with pytest.raises(ValueError, match=r"^depth has 1 NaN or infinite values, the first at \(7, 130\)"):
-        write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **{**stored, "depth": made(stored["depth"])})
+        write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **{**stored, "depth": source(stored["depth"])})
     with pytest.raises(ValueError, match="^depth should be"):
-        write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **{**stored, "depth": made(stored["depth"][:9])})
+        write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **{**stored, "depth": source(stored["depth"][:9])})
     assert not list(tmp_path.iterdir())
 
 
-def test_layers_made_while_they_are_written_are_never_whole_in_memory(tmp_path):
+def test_streamed_layers_are_never_fully_in_memory(tmp_path):
     height, width = 3000, 500
     flat = {name: LazyLayer((height, width), lambda rows: np.full((min(rows.stop, height) - rows.start, width), 0.5))
             for name in ("depth", "support", "motion")}  # fmt: skip
@@ -110,7 +110,7 @@ def test_layers_made_while_they_are_written_are_never_whole_in_memory(tmp_path):
 
 
 @pytest.mark.parametrize("with_grain", [False, True])
-def test_what_a_frame_is_made_of_comes_back_and_may_be_absent(tmp_path, with_grain):
+def test_source_layers_round_trip_and_are_optional(tmp_path, with_grain):
     stored = layers(150, 60)  # more rows than one write holds
     detail, grain = detail_of(stored), np.full((150, 60, 3), 0.25, np.float32) if with_grain else None
     path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, grain=grain, detail=detail, margin=(3, 2), **stored)
@@ -131,7 +131,7 @@ def test_what_a_frame_is_made_of_comes_back_and_may_be_absent(tmp_path, with_gra
 
 
 @pytest.mark.parametrize("name", ["splat", "plate", "source"])
-def test_a_bad_layer_of_what_a_frame_is_made_of_is_named(tmp_path, name):
+def test_invalid_source_layer_is_named(tmp_path, name):
     stored = layers()
     good = detail_of(stored)
     flat = dataclasses.replace(good, **{name: getattr(good, name)[:5]})
@@ -145,14 +145,14 @@ def test_a_bad_layer_of_what_a_frame_is_made_of_is_named(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_layer_that_is_a_row_of_the_table_needs_nothing_else_here(tmp_path, monkeypatch):
+def test_new_layer_needs_only_a_table_row(tmp_path, monkeypatch):
     rows = (
         FrameLayer("Distance", ("Distance.V",), "float", "Distance.V", "from the camera", part="distance"),
         FrameLayer("Sky", tuple(f"Sky.{c}" for c in "RGBA"), "half", "Sky.R G B A", "what is far", part="sky"),
     )
     monkeypatch.setattr(exr, "_MORE", {row.name: row for row in rows})
     stored = layers()
-    more = {"Distance": stored["depth"] * 1.5, "Sky": made(stored["rgba"])}
+    more = {"Distance": stored["depth"] * 1.5, "Sky": source(stored["rgba"])}
     path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, detail=detail_of(stored), more=more, **stored)
     frame = read_frozen_exr(path)
     np.testing.assert_array_equal(frame.more["Distance"], stored["depth"] * 1.5)
@@ -196,27 +196,27 @@ def test_frames_leave_in_the_light_of_the_footage_and_come_back_as_rec709(tmp_pa
     """Colours, grain and splats are converted; decoded from that space they equal the Rec.709 values."""
     metadata = dataclasses.replace(METADATA, light=light)
     rng = np.random.default_rng(1)
-    given = layers()
-    shape = given["rgba"].shape[:2]
+    written = layers()
+    shape = written["rgba"].shape[:2]
     grain = rng.normal(0.0, 0.02, (*shape, 3)).astype(np.float32)
     splat = rng.uniform(0.0, 2.0, (*shape, 4)).astype(np.float32)
     detail = DetailLayers(splat, np.ones(shape, np.float32), np.ones(shape, np.float32))
-    path = write_frozen_exr(tmp_path / "a.exr", metadata=metadata, grain=grain, detail=detail, **given)
+    path = write_frozen_exr(tmp_path / "a.exr", metadata=metadata, grain=grain, detail=detail, **written)
     image = oiio.ImageBuf(str(path))
     spec = image.spec()
     assert spec.getattribute("chromaticities") == pytest.approx(PRIMARIES[light][1], abs=1e-6)
     assert spec.getattribute("oiio:ColorSpace") == f"lin_{light}_scene"
     stored = np.asarray(image.get_pixels(oiio.FLOAT))[..., [spec.channelnames.index(c) for c in "RGB"]]
     expected = InputSpace("lin", light).to_linear(stored)
-    scale = np.abs(given["rgba"][..., :3]).max()
-    assert np.abs(expected - given["rgba"][..., :3]).max() < 2e-3 * scale < np.abs(stored - expected).max()
+    scale = np.abs(written["rgba"][..., :3]).max()
+    assert np.abs(expected - written["rgba"][..., :3]).max() < 2e-3 * scale < np.abs(stored - expected).max()
     read = read_frozen_exr(path)
     assert read.metadata.light == light
-    np.testing.assert_allclose(read.rgba, given["rgba"], atol=2e-3 * scale)
+    np.testing.assert_allclose(read.rgba, written["rgba"], atol=2e-3 * scale)
     np.testing.assert_allclose(read.grain, grain, atol=0.2 * np.abs(grain).max())
     np.testing.assert_allclose(np.asarray(read.detail.splat), splat, atol=0.02)
     np.testing.assert_array_equal(read.rgba[..., 3], read_frozen_exr(
-        write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, **given)).rgba[..., 3])  # fmt: skip
+        write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, **written)).rgba[..., 3])  # fmt: skip
 
 
 def test_light_that_no_frame_leaves_in_is_refused(tmp_path):

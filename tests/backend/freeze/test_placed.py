@@ -46,11 +46,11 @@ def test_colours_in_turned_directions_are_those_of_before(degree, seed):
 
 
 def test_two_turns_are_one_and_a_turn_back_undoes_it():
-    one, other, sh = rotation(5), rotation(6), cloud(20, 3).sh
+    first, second, sh = rotation(5), rotation(6), cloud(20, 3).sh
     np.testing.assert_allclose(
-        rotated_harmonics(rotated_harmonics(sh, one), other), rotated_harmonics(sh, other @ one), atol=2e-6
+        rotated_harmonics(rotated_harmonics(sh, first), second), rotated_harmonics(sh, second @ first), atol=2e-6
     )
-    np.testing.assert_allclose(rotated_harmonics(rotated_harmonics(sh, one), one.T), sh, atol=2e-6)
+    np.testing.assert_allclose(rotated_harmonics(rotated_harmonics(sh, first), first.T), sh, atol=2e-6)
 
 
 @pytest.mark.parametrize("scale", [0.02, 1.0, 37.5])
@@ -83,20 +83,20 @@ def test_the_moved_camera_sees_the_same_picture(degree):
             height=48, with_depth=True,
         )  # fmt: skip
 
-    one = seen(was, np.eye(4)[None])
-    other = seen(placed(was, where), where.viewmats(np.eye(4)[None]))
-    assert float((one.colors - other.colors).abs().mean()) < 2e-4
-    solid = (one.alphas[0] > 0.5) & (other.alphas[0] > 0.5)
-    ratio = (other.depth_expected[0] / one.depth_expected[0])[solid]
+    first = seen(was, np.eye(4)[None])
+    moved_picture = seen(placed(was, where), where.viewmats(np.eye(4)[None]))
+    assert float((first.colors - moved_picture.colors).abs().mean()) < 2e-4
+    solid = (first.alphas[0] > 0.5) & (moved_picture.alphas[0] > 0.5)
+    ratio = (moved_picture.depth_expected[0] / first.depth_expected[0])[solid]
     assert abs(float(ratio.median()) / 12.5 - 1.0) < 1e-4
 
 
-def test_the_way_there_and_back():
+def test_placement_and_its_inverse_cancel():
     where = Similarity.of(Placement([0, -3, 0, 1, 3, 0, 0, 2, 0, 0, 3, -5, 0, 0, 0, 1]))
     assert where.scale == pytest.approx(3.0) and np.allclose(where.rotation @ where.rotation.T, np.eye(3), atol=1e-15)
     np.testing.assert_allclose(where.after(where.inverse()).matrix, np.eye(4), atol=1e-12)
     was = cloud(30, 3)
     back = placed(placed(was, where), where.inverse())
-    for one, other in zip(was, back, strict=True):
-        np.testing.assert_allclose(other, one, atol=3e-5)
+    for before, after in zip(was, back, strict=True):
+        np.testing.assert_allclose(after, before, atol=3e-5)
     assert math.isclose(float(where.points(np.zeros(3))[2]), -5.0)

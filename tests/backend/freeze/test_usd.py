@@ -83,7 +83,7 @@ def test_the_camera_sees_what_the_solve_saw(tmp_path, varies, metres):
     assert len(camera.GetFocalLengthAttr().GetTimeSamples()) == (4 if varies else 0)
 
 
-def test_an_environment_without_usd_says_so(tmp_path, monkeypatch):
+def test_missing_usd_gives_a_readable_error(tmp_path, monkeypatch):
     def missing(name: str):
         raise ImportError(f"No module named {name}")
 

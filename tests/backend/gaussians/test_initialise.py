@@ -12,7 +12,7 @@ def test_root_mean_square_of_three_nearest():
     assert neighbour_distance(points).dtype == torch.float32
 
 
-def test_twins_count_each_other_at_no_distance():
+def test_duplicates_are_neighbours_at_distance_zero():
     points = torch.tensor([[1.0, 2, 3]]).repeat(6, 1)
     assert neighbour_distance(points).tolist() == [0.0] * 6  # `initialise` clamps to its smallest scale
 
@@ -24,7 +24,7 @@ def test_fewer_points_than_neighbours():
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_points_that_are_nowhere_are_refused(bad):
+def test_non_finite_points_are_refused(bad):
     points = torch.rand(6, 3)
     points[2, 1] = bad
     with pytest.raises(ValueError, match="finite"):

@@ -101,16 +101,16 @@ def test_budget_is_never_exceeded_and_nan_is_pruned():
     assert torch.isfinite(model.params["means"]).all()
 
 
-def test_a_hosts_own_parameters_ride_through_growth_and_checkpoints():
+def test_host_parameters_survive_growth_and_checkpoints():
     model = small_model()
-    own = model.adopt("hyper", (2,), -0.01)
+    hyper = model.adopt("hyper", (2,), -0.01)
     with torch.no_grad():
-        own += torch.arange(6.0)[:, None]
+        hyper += torch.arange(6.0)[:, None]
     model.hidden[3, 5] = True
     optimizer = adam(model)
-    own.grad = torch.ones_like(own)
+    hyper.grad = torch.ones_like(hyper)
     optimizer.step()
-    values, moments = own.detach().clone(), optimizer.state[own]["exp_avg"].clone()
+    values, moments = hyper.detach().clone(), optimizer.state[hyper]["exp_avg"].clone()
     parent = torch.tensor([0, 3, 3, 5])
     model.rebuild(parent, torch.tensor([False, False, True, False]), optimizer)
     grown = model.params["hyper"]

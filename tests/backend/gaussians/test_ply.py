@@ -43,7 +43,7 @@ def test_bytes_are_channel_major_sh_and_wxyz(tmp_path):
     assert row == pytest.approx(expected)
 
 
-def test_reads_other_orders_types_and_comments(tmp_path):
+def test_reads_any_property_order_type_and_comments(tmp_path):
     """Exporters reorder properties, add colours, drop normals and append faces."""
     names = [n for n in property_names(1) if not n.startswith("n")][::-1]
     values = {name: float(i) for i, name in enumerate(property_names(1))}
@@ -96,7 +96,7 @@ def test_refuses_a_file_cut_short(tmp_path):
         (b"ply\nformat binary_little_endian 1.0\n", "bad line"),
     ],
 )
-def test_refuses_other_files_in_words(tmp_path, content, message):
+def test_unsupported_files_give_a_readable_error(tmp_path, content, message):
     path = tmp_path / "x.ply"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=message):

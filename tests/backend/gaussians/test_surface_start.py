@@ -12,7 +12,7 @@ from torch_backend.motion_search import find_motion
 from torch_backend.scene import load_images, load_scene, surface_of
 from torch_backend.shot import Shot
 
-HELD, FAR, COUNT = 7, 3, 400
+WITHHELD, FAR, COUNT = 7, 3, 400
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def dense(world, tmp_path_factory, quiet):
     scene = load_scene(shot)
     for file in shot.motion.glob("*.npz"):
         file.unlink()
-    for index, color in ((HELD, (255, 0, 0)), (FAR, (0, 255, 0)), (5, (0, 0, 255)), (9, (0, 0, 255))):
+    for index, color in ((WITHHELD, (255, 0, 0)), (FAR, (0, 255, 0)), (5, (0, 0, 255)), (9, (0, 0, 255))):
         near = xyz[rng.integers(len(xyz), size=COUNT)] + rng.normal(0, 1e-3, (COUNT, 3)).astype(np.float32)
         far = near + 50 * np.ptp(xyz, axis=0)
         points = (far if index == FAR else near).astype(np.float32)
@@ -40,7 +40,7 @@ def dense(world, tmp_path_factory, quiet):
 
 def start(dense, budget=5000, **options):
     scene, images = dense
-    train = [i for i in scene.solved if i != HELD]
+    train = [i for i in scene.solved if i != WITHHELD]
     generator = torch.Generator("cpu").manual_seed(0)
     pictures = images[[scene.solved.index(i) for i in train]]
     return initialise(scene, pictures, train, 8, InitConfig(**options), generator, budget).params

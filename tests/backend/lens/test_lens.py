@@ -55,13 +55,13 @@ def colmap(tmp_path_factory):
     return {name: dict(np.load(folder / f"{name}.npz", allow_pickle=False)) for name in LENSES}
 
 
-def solved(folder: Path, model: str, extra, focal: float, K, width=WIDTH, height=HEIGHT, **told) -> Shot:
+def solved(folder: Path, model: str, extra, focal: float, K, width=WIDTH, height=HEIGHT, **facts) -> Shot:
     """Shot with the files of a solve."""
     shot = Shot.create(folder / "lens.splannequin")
     frames = [CameraFrame(n, np.eye(4).ravel().tolist(), [float(v) for v in K]) for n in (1, 2)]
     write_json(shot.solve / "cameras.json", CameraPath(width, height, frames).to_json())
     record = {"version": 1, "camera_model": model, "distortion": list(map(float, extra)), "focal_px": float(focal)}
-    write_json(shot.solve / "solve.json", {**record, **told})
+    write_json(shot.solve / "solve.json", {**record, **facts})
     return shot
 
 
@@ -108,7 +108,7 @@ def test_the_lens_is_colmaps_both_ways(colmap, shot_of, name):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_there_and_back_is_the_identity_to_a_millionth_of_a_pixel(shot_of, name):
+def test_distort_and_undistort_cancel_to_a_millionth_of_a_pixel(shot_of, name):
     lens = load_lens(shot_of(name))
     lens.check()
     at = centres(WIDTH, HEIGHT).reshape(-1, 2)
@@ -125,8 +125,8 @@ def test_maps_in_float32_compose_to_the_identity_where_both_are_defined(shot_of,
     lens = load_lens(shot_of(name))
     across, down = needed_margin(lens, WIDTH, HEIGHT)
     at = centres(WIDTH, HEIGHT)
-    there = pixels_of(undistort_map(lens, WIDTH, HEIGHT), WIDTH, HEIGHT)
-    np.testing.assert_allclose(lens.to_plate(there.reshape(-1, 2)).reshape(at.shape), at, atol=1e-3)
+    undistorted = pixels_of(undistort_map(lens, WIDTH, HEIGHT), WIDTH, HEIGHT)
+    np.testing.assert_allclose(lens.to_plate(undistorted.reshape(-1, 2)).reshape(at.shape), at, atol=1e-3)
     beyond = (across / WIDTH, down / HEIGHT)
     whole = pixels_of(redistort_map(lens, WIDTH, HEIGHT, beyond), WIDTH + 2 * across, HEIGHT + 2 * down)
     back = lens.to_original((whole - [across, down]).reshape(-1, 2)).reshape(at.shape)
@@ -255,25 +255,25 @@ def test_a_solve_that_tells_no_lens_is_refused_in_words(tmp_path):
 def test_overscan_in_percent_and_as_the_lens_needs(shot_of, tmp_path):
     shot = shot_of("barrel")
     lens = load_lens(shot)
-    own = np.array([lens.intrinsics] * 2) / 2
+    half_size = np.array([lens.intrinsics] * 2) / 2
 
-    def of(overscan, Ks=own):
+    def of(overscan, Ks=half_size):
         return margin(shot, FreezeParams(overscan=overscan), 80, 60, Ks)
 
     assert of(0.0) == (0, 0)
     assert of(10.0) == (8, 6) and of(1.0) == (1, 1)
     assert of(-1.0) == needed_margin(lens, 80, 60) > (0, 0)
-    other = own * [1.2, 1.2, 1.0, 1.0]
-    assert of(10.0, other) == (8, 6), "a percentage needs no lens"
+    enlarged = half_size * [1.2, 1.2, 1.0, 1.0]
+    assert of(10.0, enlarged) == (8, 6), "a percentage needs no lens"
     with pytest.raises(JobError, match="another focal length"):
-        of(-1.0, other)
+        of(-1.0, enlarged)
     with pytest.raises(JobError, match="150 percent"):
         of(150.0)
     with pytest.raises(JobError, match="nan percent"):
         of(float("nan"))
     path = TakeFolder(tmp_path).redistort
-    assert write_take_map(shot, path, 80, 60, (8, 6), other) is None and not path.exists()
-    written = write_take_map(shot, path, 80, 60, (8, 6), own)
+    assert write_take_map(shot, path, 80, 60, (8, 6), enlarged) is None and not path.exists()
+    written = write_take_map(shot, path, 80, 60, (8, 6), half_size)
     assert written == path
     np.testing.assert_array_equal(
         oiio.ImageBuf(str(written)).get_pixels(oiio.FLOAT), redistort_map(lens, 160, 120, (0.1, 0.1))

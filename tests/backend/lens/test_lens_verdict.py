@@ -48,19 +48,19 @@ def test_bends_that_no_camera_has(lens, expected):
     assert bool(doubt_of(*lens)) == bool(expected)
 
 
-def test_a_focal_length_that_was_given_is_not_doubted_unless_the_solve_ran_off_from_it():
+def test_known_focal_length_is_doubted_only_if_the_solve_diverged_from_it():
     narrow = radial(9000.0, 0.0)
     assert doubt_of(*narrow) == "narrow" and doubt_of(*narrow, 8000.0) == ""
     assert doubt_of(*radial(600.0, 0.0), 800.0) == "off" and doubt_of(*radial(600.0, 0.0), 700.0) == ""
 
 
 def answer(focal=600.0, **lens):
-    told = {"doubt": "", "held": False, "found_px": focal, "width": 640, "height": 480, **lens}
-    return {"focal_px": focal, "distortion": [4.08], "lens": told}
+    lens_facts = {"doubt": "", "held": False, "found_px": focal, "width": 640, "height": 480, **lens}
+    return {"focal_px": focal, "distortion": [4.08], "lens": lens_facts}
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("solve", "words"),
     [
         (answer(5000.0), "7.3 degrees wide (5000 px)"),
         (answer(80.0), "151.9 degrees wide (80 px)"),
@@ -69,43 +69,43 @@ def answer(focal=600.0, **lens):
         (answer(impossible="strong"), "its distortion is far too strong (4.08)"),
     ],
 )
-def test_a_lens_that_no_camera_has_is_refused_in_one_sentence(told, words):
+def test_a_lens_that_no_camera_has_is_refused_in_one_sentence(solve, words):
     with pytest.raises(JobError) as error:
-        refuse_lens(told)
+        refuse_lens(solve)
     assert error.value.message == f"The solve found an impossible lens: {words}."
     assert error.value.hint and error.value.exit_code == ExitCode.SOLVE
 
 
-def test_lenses_that_cameras_have_pass_and_so_does_one_that_was_given():
-    for told in (answer(), answer(80.0, view_deg=140.0), answer(5000.0, given_px=5000.0)):
-        refuse_lens(told)
+def test_plausible_and_user_supplied_lenses_pass():
+    for solve in (answer(), answer(80.0, view_deg=140.0), answer(5000.0, given_px=5000.0)):
+        refuse_lens(solve)
 
 
-def test_a_given_focal_length_that_was_held_or_left_is_said():
-    held = lens_remarks(answer(800.0, held=True, doubt="off", found_px=1200.0, given_px=800.0))
-    assert held[0][0].endswith("(1200 px instead of 800), but it is kept fixed.")
+def test_fixed_or_refined_focal_length_is_reported():
+    kept_focal = lens_remarks(answer(800.0, held=True, doubt="off", found_px=1200.0, given_px=800.0))
+    assert kept_focal[0][0].endswith("(1200 px instead of 800), but it is kept fixed.")
     left = lens_remarks(answer(1200.0, doubt="off", given_px=800.0))
     assert left[0][0] == "The solved focal length is 1200 px, but 800 px was set."
 
 
 def solved(folder, tools, pictures, **request):
     """(answer, poses by picture) of COLMAP alone, without undistorted frames and mattes."""
-    told, _ = tools.asked(folder, pictures, **request)
-    names = told["solved"]
-    (folder / "request.json").write_text(json.dumps(told))
+    request_facts, _ = tools.request_for(folder, pictures, **request)
+    names = request_facts["solved"]
+    (folder / "request.json").write_text(json.dumps(request_facts))
     found = run_worker(folder / "request.json", folder / "log.txt", tools.recorder())["result"]
     poses = json.loads((folder / "poses.json").read_text())
     return found, [np.array(poses[name]["pose"]) for name in names if name in poses]
 
 
-def test_a_focal_length_that_is_to_be_held_is_held_to_the_pixel(tmp_path, tools):
+def test_fixed_focal_length_stays_exact(tmp_path, tools):
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0), -0.06) for pose in tools.handheld(9)]
     found, poses = solved(tmp_path, tools, pictures, focal_px=306.0, hold_focal=True)
     assert len(poses) == 9 and found["focal_px"] == 306.0 and found["lens"]["given_px"] == 306.0
     assert found["distortion"] == [pytest.approx(-0.06, abs=0.02)]
 
 
-def test_a_focal_length_of_the_file_is_what_a_clip_gets_that_does_not_tell_its_own(tmp_path, tools):
+def test_file_focal_length_is_used_if_the_clip_gives_none(tmp_path, tools):
     """A wall seen frontally, as in test_solving: the user gave no focal length, but the file has one."""
     poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(8)]
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0), -0.06) for pose in poses]

@@ -35,15 +35,15 @@ def test_a_polynomial_and_its_slopes_are_what_their_terms_say():
     rng = np.random.default_rng(0)
     points = rng.uniform([-1.0, 2.0], [3.0, 5.0], (200, 2))
     x, y = points.T
-    made = fitted(points, np.stack([x * x * y - 3.0, y], 1), 3, (-1.0, 2.0, 3.0, 5.0))
-    assert len(made.terms) == 2 * len(exponents(3)[0]) == 20
+    fit = fitted(points, np.stack([x * x * y - 3.0, y], 1), 3, (-1.0, 2.0, 3.0, 5.0))
+    assert len(fit.terms) == 2 * len(exponents(3)[0]) == 20
     far = rng.uniform([-4.0, -1.0], [6.0, 9.0], (50, 2))
     x, y = far.T
-    np.testing.assert_allclose(made(far), np.stack([x * x * y - 3.0, y], 1), atol=1e-9)
+    np.testing.assert_allclose(fit(far), np.stack([x * x * y - 3.0, y], 1), atol=1e-9)
     expected = np.stack([np.stack([2 * x * y, x * x], 1), np.stack([0 * x, 1 + 0 * x], 1)], 1)
-    np.testing.assert_allclose(made.slopes(far), expected, atol=1e-9)
+    np.testing.assert_allclose(fit.slopes(far), expected, atol=1e-9)
     np.testing.assert_allclose(
-        made.of_grid(x[:3], y[:4]), made(np.stack(np.meshgrid(x[:3], y[:4]), -1).reshape(-1, 2)).reshape(4, 3, 2)
+        fit.of_grid(x[:3], y[:4]), fit(np.stack(np.meshgrid(x[:3], y[:4]), -1).reshape(-1, 2)).reshape(4, 3, 2)
     )
     flat = Polynomial(0, (0.0, 0.0, 1.0, 1.0), (2.0, 5.0))
     np.testing.assert_array_equal(flat.slopes(far), np.zeros((50, 2, 2)))

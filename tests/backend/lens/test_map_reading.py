@@ -85,8 +85,8 @@ def test_both_ways_and_overscan_give_the_same_lens(tmp_path):
     assert error_px(over, 0.1) < 2e-3
     # All maps give the same lens and plate: the widest window without missing pixels.
     at = places(WIDTH, HEIGHT)[::9, ::9].reshape(-1, 2)
-    for other in (back, over):
-        np.testing.assert_allclose(other.to_original(at), wide.to_original(at), atol=0.05)
+    for variant in (back, over):
+        np.testing.assert_allclose(variant.to_original(at), wide.to_original(at), atol=0.05)
 
 
 def test_maps_that_this_product_writes_are_read_again(tmp_path):
@@ -128,7 +128,7 @@ def test_sixteen_bits_are_smoothed(tmp_path):
     assert error_px(lens) < 0.02
 
 
-def test_what_is_cut_off_or_empty_or_transparent_says_nothing(tmp_path):
+def test_invalid_map_areas_are_ignored(tmp_path):
     st = undistorting(beyond=0.2)
     inside = ((st > 0) & (st < 1)).all(-1, keepdims=True)
     for name, path in {
@@ -137,13 +137,13 @@ def test_what_is_cut_off_or_empty_or_transparent_says_nothing(tmp_path):
     }.items():
         lens, _ = read(path)
         assert error_px(lens, 0.2) < 2e-3, name
-    made = np.concatenate([st, inside.astype(float)], -1)
-    spec = oiio.ImageSpec(*made.shape[1::-1], 3, oiio.FLOAT)
+    rgb = np.concatenate([st, inside.astype(float)], -1)
+    spec = oiio.ImageSpec(*rgb.shape[1::-1], 3, oiio.FLOAT)
     spec.channelnames = ("R", "G", "A")
-    made[..., :2][~inside[..., 0]] = 0.7
+    rgb[..., :2][~inside[..., 0]] = 0.7
     output = oiio.ImageOutput.create(str(tmp_path / "c.exr"))
     assert open_output(output, tmp_path / "c.exr", spec)
-    assert output.write_image(made.astype(np.float32)) and output.close()
+    assert output.write_image(rgb.astype(np.float32)) and output.close()
     assert error_px(read(str(tmp_path / "c.exr"))[0], 0.2) < 2e-3
 
 
@@ -162,11 +162,11 @@ def test_layers(tmp_path):
         read(written(tmp_path, st[..., :1], names=("Y",), name="grey.exr"))
 
 
-def test_anamorphic_footage_in_its_own_pixels_or_square_ones(tmp_path):
+def test_anamorphic_maps_work_for_stored_and_square_pixels(tmp_path):
     st = undistorting(beyond=0.2)
-    told = {"reading": {"pixel_aspect": 2.0}}
-    for made in (st, 0.5 * (st[:, ::2] + st[:, 1::2])):
-        lens, _ = read(written(tmp_path, made), **told)
+    footage = {"reading": {"pixel_aspect": 2.0}}
+    for variant in (st, 0.5 * (st[:, ::2] + st[:, 1::2])):
+        lens, _ = read(written(tmp_path, variant), **footage)
         assert error_px(lens, 0.2) < 0.05 and lens.window[0] == pytest.approx(lens.window[1], abs=0.01)
     with pytest.raises(JobError, match="aspect ratios differ"):
         read(written(tmp_path, st[:, ::2]))
@@ -222,7 +222,7 @@ def test_what_is_no_map_of_this_lens_is_refused_in_a_sentence(tmp_path, change, 
     assert refused.value.message.startswith("The ST map map.exr ")
 
 
-def test_a_map_of_the_other_picture_s_shape_is_refused_the_other_way_round_too(tmp_path):
+def test_map_of_a_different_shape_is_refused_in_both_directions(tmp_path):
     with pytest.raises(JobError, match="aspect ratios differ"):
         read(written(tmp_path, redistorting()[:, 40:280]), "redistort")
 
@@ -245,7 +245,7 @@ def test_a_map_that_bends_nothing_is_taken_and_said(tmp_path):
     assert lens.is_none and lens.window == (1.0, 1.0) and "has no distortion" in heard[0]
 
 
-def test_files_are_told_apart_by_what_is_in_them(tmp_path):
+def test_map_type_is_detected_by_content(tmp_path):
     one = written(tmp_path, undistorting(), name="a.exr")
     (tmp_path / "copy.exr").write_bytes((tmp_path / "a.exr").read_bytes())
     assert fingerprint(one) == fingerprint(str(tmp_path / "copy.exr"))

@@ -116,7 +116,7 @@ def test_the_map_is_the_lens_model_without_blank_pixels(maps, name):
     assert min(gaps) < 2e-3
 
 
-def test_a_lens_without_distortion_is_left_alone(maps):
+def test_undistorted_lens_changes_nothing(maps):
     assert np.allclose(maps("none")[1], identity(120, 160), atol=1e-3)
 
 
@@ -161,7 +161,7 @@ def test_bands_are_the_matrix_in_float(kind):
         BandUndistorter(where[..., 0])
 
 
-def test_bands_change_nothing_where_nothing_moves_and_reach_other_sizes():
+def test_row_bands_do_not_change_the_result_at_any_size():
     picture = np.random.default_rng(0).normal(0.5, 10.0, (70, 30, 3)).astype(np.float32)
     same = BandUndistorter(identity(70, 30))(picture, lambda x: x, lambda x: x, np.empty_like(picture))
     assert (same == picture).all()
@@ -170,7 +170,7 @@ def test_bands_change_nothing_where_nothing_moves_and_reach_other_sizes():
 
 
 @pytest.mark.parametrize("name", ["barrel", "pincushion"])
-def test_there_and_back(maps, name):
+def test_distort_and_undistort_cancel(maps, name):
     """A smooth picture that is distorted by the lens and undistorted equals the picture without the lens."""
 
     def scene(x, y):

@@ -77,16 +77,16 @@ def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
     for n in (0, 4, 9):
         rays = np.concatenate([(TRUTH.to_plate(at) - TRUTH.centre) / 220.0, np.ones((9, 1))], 1)
         seen = rays * 3.0  # camera axes of frame n, metres
-        others = [k for k in (0, 4, 9) if k != n]
-        for k in others:
+        neighbours = [k for k in (0, 4, 9) if k != n]
+        for k in neighbours:
             true = between(poses[n], poses[k], seen)
             mine = between(solved[n], solved[k], seen * size)
             fx, fy, cx, cy = lens.intrinsics
             plate = mine[:, :2] / mine[:, 2:] * [fx, fy] + [cx, cy]
-            there = TRUTH.to_original(true[:, :2] / true[:, 2:] * 220.0 + TRUTH.centre)
-            inside = ((there > 0) & (there < [WIDTH, HEIGHT])).all(1)
-            off = np.hypot(*(lens.to_original(plate) - there)[inside].T)
-            assert off.max() < 0.25
+            true_pixels = TRUTH.to_original(true[:, :2] / true[:, 2:] * 220.0 + TRUTH.centre)
+            inside = ((true_pixels > 0) & (true_pixels < [WIDTH, HEIGHT])).all(1)
+            error = np.hypot(*(lens.to_original(plate) - true_pixels)[inside].T)
+            assert error.max() < 0.25
 
     again = tools.recorder()
     assert solve_shot(shot, config, again)["focal_px"] == result["focal_px"]
@@ -107,7 +107,7 @@ def test_a_map_the_wrong_way_round_is_noticed(clip, tools, tmp_path):
     assert [w for w in report.warnings if "The ST map does not straighten the frames: they are still bent by" in w]
 
 
-def test_other_cameras_and_a_map_are_one_lens_too_many(clip, tools):
+def test_imported_cameras_and_a_map_together_are_refused(clip, tools):
     shot, _, folder = clip
     with pytest.raises(JobError, match="already have a lens") as refused:
         solve_shot(shot, SolveConfig(st_map=str(folder / "undistort.exr")), tools.recorder(), cameras=str(folder))
@@ -118,7 +118,7 @@ def test_other_cameras_and_a_map_are_one_lens_too_many(clip, tools):
         solve_shot(shot, SolveConfig(st_map=str(folder / "gone.exr")), tools.recorder())
 
 
-def test_a_map_is_told_by_what_is_in_it_and_not_by_where_it_lies(clip, tools):
+def test_map_is_identified_by_content_not_path(clip, tools):
     """A copy of the file keeps the solve; another direction of the map does not."""
     from torch_backend.sfm.solving import _key  # pyright: ignore[reportPrivateUsage]
 
@@ -129,13 +129,13 @@ def test_a_map_is_told_by_what_is_in_it_and_not_by_where_it_lies(clip, tools):
     assert _key(plain, frames, [], {}) == _key(SolveConfig(st_map_way="redistort"), frames, [], {})
 
 
-def test_no_other_lens_is_tried_where_the_map_is_the_lens(tmp_path):
+def test_map_lens_disables_lens_retries(tmp_path):
     lens = {"doubt": "bent", "found_bend": -0.4, "found_deg": 140.0, "view_deg": 70.0, "held": True}
     answer = {"result": {"registered": 9, "lens": lens}}
     best = Attempt("first", tmp_path, answer, Fault("bent", JobError("a")), 9)
-    asked = {"camera_model": "SIMPLE_RADIAL", "features": 800}
-    assert next_strategy(best, asked, set()) is not None
-    assert next_strategy(best, {**asked, "hold_bend": True}, set()) is None
+    request = {"camera_model": "SIMPLE_RADIAL", "features": 800}
+    assert next_strategy(best, request, set()) is not None
+    assert next_strategy(best, {**request, "hold_bend": True}, set()) is None
 
 
 def test_what_is_left_of_the_lens_is_measured_at_the_corner():

@@ -20,10 +20,10 @@ def frame(change: float, seed: int = 0, noise_px: float = 0.3, depths: tuple[flo
     rotation, shift = quat_to_rotation(np.array([1.0, 0.025, -0.05, 0.01])), np.array([0.1, -0.05, 0.2])
     at = points @ rotation.T + shift
     seen = np.exp(change) * at[:, :2] / at[:, 2:] + rng.normal(0.0, noise_px / FOCAL, (300, 2))
-    off = np.column_stack(
+    wrong_pose = np.column_stack(
         [quat_to_rotation(np.array([1.0, 0.002, 0.0015, 0.0])) @ rotation, shift - [0.0, 0.0, 2.0 * change]]
     )
-    return seen, points, off
+    return seen, points, wrong_pose
 
 
 @pytest.mark.parametrize("change", [0.0, 0.05, 0.3, -0.2])
@@ -49,7 +49,7 @@ def test_a_zoom_is_said_with_the_frames_that_do_without_and_a_lens_that_stays_is
     assert zoom_words(still) is None
     assert zoom_words({**still, 1030: 0.2}) is None, "one odd frame is no zoom"
     zoomed = {frame: change + 0.01 * max(0, frame - 1031) for frame, change in still.items()}
-    told = zoom_words(zoomed)
-    assert told is not None and "1001 to 103" in told[1]
+    words = zoom_words(zoomed)
+    assert words is not None and "1001 to 103" in words[1]
     assert zoom_words({1: 0.0, 2: 1.0}) is None, "too few frames to tell"
     assert quality_words(60, 60, 0.3, misled=True).startswith("Poor")

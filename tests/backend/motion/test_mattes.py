@@ -207,7 +207,7 @@ def test_frames_between_keys_have_a_matte_too(tmp_path, quiet):
     assert np.mean([np.linalg.norm(middle(labels[n]) - middle(board[n])) for n in between]) < 3.0
 
 
-def test_mattes_that_are_there_are_left_alone(swaying, quiet):
+def test_existing_mattes_are_kept(swaying, quiet):
     shot, _, result = swaying
     before = stamps(shot)
     assert find_motion(shot, quiet(), static_model=None) == result
@@ -245,8 +245,8 @@ def test_a_clip_that_cannot_be_learnt_is_left_to_flow_with_a_word(swaying, tmp_p
     assert not report.events, "mattes that are there need no model"
     shutil.rmtree(shot.motion)
     assert find_motion(shot, report, static_model=refuse) == swaying[2]
-    told = [event[1:] for event in report.events if event[0] == "warning"]
-    assert told == [("Motion is found by optical flow only: The camera hardly moves.", "Walk.")]
+    warnings = [event[1:] for event in report.events if event[0] == "warning"]
+    assert warnings == [("Motion is found by optical flow only: The camera hardly moves.", "Walk.")]
 
 
 def test_what_neither_a_static_model_nor_most_frames_show_moves(tmp_path, quiet):
@@ -262,7 +262,7 @@ def test_what_neither_a_static_model_nor_most_frames_show_moves(tmp_path, quiet)
     assert (np.delete(labels, 6, axis=0) == MOVING).mean() < 0.01
 
 
-def test_a_damaged_matte_is_named_and_made_anew(swaying, quiet):
+def test_damaged_matte_is_reported_and_recomputed(swaying, quiet):
     shot, *_ = swaying
     victim = shot.solve / "motion" / f"{NUMBERS[3]:06d}.png"
     whole = victim.read_bytes()
@@ -273,7 +273,7 @@ def test_a_damaged_matte_is_named_and_made_anew(swaying, quiet):
     assert victim.read_bytes() == whole
 
 
-def test_mattes_of_other_cameras_are_not_read(swaying, tmp_path, quiet):
+def test_mattes_of_an_older_solve_are_not_read(swaying, tmp_path, quiet):
     shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
     key = motion_key(shot)
     path = CameraPath.load(shot.solve / "cameras.json")
@@ -322,11 +322,11 @@ def test_a_killed_search_goes_on_where_it_was(swaying, tmp_path, quiet):
     assert (mattes(shot) == mattes(swaying[0])).all()
     names = [f"{n:06d}{suffix}" for n in NUMBERS for suffix in (".png", ".npz")]  # with so few frames, each is a key
     assert {p.name for p in (shot.solve / "motion").iterdir()} == {"motion.json", *names}
-    one, other = load_surface(shot), load_surface(swaying[0])
-    assert (one.xyz == other.xyz).all() and (one.frames == other.frames).all()
+    first, second = load_surface(shot), load_surface(swaying[0])
+    assert (first.xyz == second.xyz).all() and (first.frames == second.frames).all()
 
 
-def test_a_shot_without_cameras_says_so(tmp_path, quiet):
+def test_missing_cameras_are_reported(tmp_path, quiet):
     shot = Shot.create(tmp_path / "empty.splannequin")
     with pytest.raises(JobError, match="has no cameras yet"):
         find_motion(shot, quiet(), static_model=None)
@@ -372,7 +372,7 @@ def test_what_moves_gives_no_points(swaying):
         assert len(x) > 500 and inner(board)[n][y, x].mean() < 0.01
 
 
-def test_a_camera_that_stands_still_gives_no_points(tmp_path, quiet):
+def test_static_camera_gives_no_points(tmp_path, quiet):
     shot, _ = build(tmp_path, travel=0.0)
     find_motion(shot, quiet(), static_model=None)
     assert not len(load_surface(shot).xyz)
@@ -434,7 +434,7 @@ def paint(shot: Shot, pixels: np.ndarray, number: int = NUMBERS[0]) -> None:
 
 
 @pytest.fixture
-def own(swaying, tmp_path):
+def shot_copy(swaying, tmp_path):
     return Shot(shutil.copytree(swaying[0].root, tmp_path / "own.splannequin"))
 
 
@@ -446,75 +446,75 @@ def ramp(dtype) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_paint_of_any_depth_goes_before_what_was_found(own, dtype, channels):
-    key = motion_key(own)
+def test_paint_of_any_depth_goes_before_what_was_found(shot_copy, dtype, channels):
+    key = motion_key(shot_copy)
     pixels = ramp(dtype)
     if channels > 1:
         pixels = np.repeat(pixels[..., None], channels, -1)
         if channels == 4:
             pixels[..., 3] = np.iinfo(dtype).max
-    paint(own, pixels)
-    labels = load_motion(own, NUMBERS[0])
-    assert labels is not None and motion_key(own) != key
+    paint(shot_copy, pixels)
+    labels = load_motion(shot_copy, NUMBERS[0])
+    assert labels is not None and motion_key(shot_copy) != key
     assert (labels == np.repeat(np.array([STILL, UNKNOWN, MOVING], np.uint8), WIDTH // 3)[None]).all()
-    assert (load_motion(own, NUMBERS[1]) == load_motion(own, NUMBERS[1])).all()
+    assert (load_motion(shot_copy, NUMBERS[1]) == load_motion(shot_copy, NUMBERS[1])).all()
 
 
-def test_paint_of_another_size_is_fitted_without_in_between_values(own):
+def test_paint_of_another_size_is_fitted_without_in_between_values(shot_copy):
     pixels = np.zeros((190, 251), np.uint8)
     pixels[:, 125:] = 255
-    paint(own, pixels)
-    labels = load_motion(own, NUMBERS[0])
+    paint(shot_copy, pixels)
+    labels = load_motion(shot_copy, NUMBERS[0])
     assert labels is not None and labels.shape == (HEIGHT, WIDTH)
     edge = int(125 * WIDTH / 251)
     assert (labels[:, :edge] == STILL).all() and (labels[:, edge + 1 :] == MOVING).all()
     assert set(np.unique(labels)) == {STILL, MOVING}
 
 
-def test_where_paint_is_transparent_the_found_matte_shows(own):
-    found = load_motion(own, NUMBERS[0])
+def test_where_paint_is_transparent_the_found_matte_shows(shot_copy):
+    found = load_motion(shot_copy, NUMBERS[0])
     pixels = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
     pixels[:, 60:, 3] = 120
-    paint(own, pixels)
-    labels = load_motion(own, NUMBERS[0])
+    paint(shot_copy, pixels)
+    labels = load_motion(shot_copy, NUMBERS[0])
     assert labels is not None and found is not None
     assert (labels[:, :60] == MOVING).all() and (labels[:, 60:] == found[:, 60:]).all()
 
 
-def test_paint_stays_when_the_shot_is_solved_again(own, quiet):
-    paint(own, np.full((HEIGHT, WIDTH), 255, np.uint8))
-    path = CameraPath.load(own.solve / "cameras.json")
+def test_paint_stays_when_the_shot_is_solved_again(shot_copy, quiet):
+    paint(shot_copy, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    path = CameraPath.load(shot_copy.solve / "cameras.json")
     path.frames[0].K[0] += 1.0
-    write_json(own.solve / "cameras.json", path.to_json())
-    assert (load_motion(own, NUMBERS[0]) == MOVING).all()  # also if there are no other mattes
-    find_motion(own, quiet(), static_model=None)
-    assert (load_motion(own, NUMBERS[0]) == MOVING).all()
-    assert (load_motion(own, NUMBERS[1]) == STILL).any()
+    write_json(shot_copy.solve / "cameras.json", path.to_json())
+    assert (load_motion(shot_copy, NUMBERS[0]) == MOVING).all()  # also if there are no other mattes
+    find_motion(shot_copy, quiet(), static_model=None)
+    assert (load_motion(shot_copy, NUMBERS[0]) == MOVING).all()
+    assert (load_motion(shot_copy, NUMBERS[1]) == STILL).any()
 
 
-def test_damaged_paint_is_named(own):
-    (own.root / PAINTED).mkdir()
-    (own.root / PAINTED / f"{NUMBERS[0]:06d}.png").write_bytes(b"\x89PNG\r\n\x1a\nnot more")
+def test_damaged_paint_is_named(shot_copy):
+    (shot_copy.root / PAINTED).mkdir()
+    (shot_copy.root / PAINTED / f"{NUMBERS[0]:06d}.png").write_bytes(b"\x89PNG\r\n\x1a\nnot more")
     with pytest.raises(JobError, match=r"painted motion matte .*001001\.png is damaged"):
-        load_motion(own, NUMBERS[0])
+        load_motion(shot_copy, NUMBERS[0])
 
 
-def test_paint_that_announces_too_many_pixels_is_refused_before_they_are_read(own):
-    paint(own, np.full((HEIGHT, WIDTH), 255, np.uint8))
-    file = own.painted_matte(NUMBERS[0])
+def test_oversized_paint_is_refused_before_decoding(shot_copy):
+    paint(shot_copy, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    file = shot_copy.painted_matte(NUMBERS[0])
     content = bytearray(file.read_bytes())
     content[16:24] = struct.pack(">II", 16000, 16000)
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
     file.write_bytes(content)
     with pytest.raises(JobError, match=r"001001\.png is 16000 x 16000 pixels according to its header"):
-        load_motion(own, NUMBERS[0])
+        load_motion(shot_copy, NUMBERS[0])
 
 
 # --------------------------------------------------------------------------------------------------- in one process
 
 
 @pytest.mark.parametrize("order", ["cv2, OpenImageIO, av", "OpenImageIO, av, cv2", "torch, av, cv2, OpenImageIO"])
-def test_opencv_lives_beside_the_other_readers_of_pictures(order, tmp_path):
+def test_opencv_coexists_with_other_image_readers(order, tmp_path):
     """Each library brings its own zlib, libpng or FFmpeg; pycolmap's libraries conflict with OpenImageIO's."""
     clip = Path(__file__).resolve().parents[3] / "examples" / "sitting.mp4"
     code = f"""

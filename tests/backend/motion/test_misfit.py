@@ -40,9 +40,9 @@ def disc(radius: float) -> np.ndarray:
     return np.hypot(X - 70.0, Y - 50.0) < radius
 
 
-def moving(frame: np.ndarray, shown: np.ndarray, others: list[Sight]) -> np.ndarray:
+def moving(frame: np.ndarray, shown: np.ndarray, witnesses: list[Sight]) -> np.ndarray:
     config = MisfitConfig()
-    difference = misfit(sight(frame), INVERSE, shown, others, GRID, UNIT, config)
+    difference = misfit(sight(frame), INVERSE, shown, witnesses, GRID, UNIT, config)
     return seeded(difference > config.weak, difference > config.strong, 12)
 
 
@@ -60,7 +60,7 @@ def test_what_the_world_at_rest_lacks_is_found_whatever_noise_and_exposure(sigma
 
 
 @pytest.mark.parametrize("sigma", [0.0, 2.0, 8.0])
-def test_noise_alone_is_no_mover(sigma: float) -> None:
+def test_noise_is_not_a_mover(sigma: float) -> None:
     assert moving(noisy(wall(), sigma, 1), noisy(wall(), sigma, 2), around(sigma)).mean() < 0.01
 
 
@@ -70,37 +70,37 @@ def test_one_witness_that_errs_makes_no_mover() -> None:
     poor = wall()
     poor[disc(8.0)] = 200, 30, 30
     assert not moving(noisy(wall(), 2.0, 1), noisy(poor, 2.0, 2), around(2.0)).any()
-    others = around(2.0)
-    for other in others:
-        other.colors[disc(16.0)] = 200, 30, 30
-    assert not moving(noisy(wall(), 2.0, 1), noisy(wall(), 2.0, 2), others).any()
+    witnesses = around(2.0)
+    for witness in witnesses:
+        witness.colors[disc(16.0)] = 200, 30, 30
+    assert not moving(noisy(wall(), 2.0, 1), noisy(wall(), 2.0, 2), witnesses).any()
 
 
-def test_a_frame_that_is_unlike_everywhere_has_no_movers() -> None:
+def test_frame_that_differs_everywhere_has_no_movers() -> None:
     """A flash, or a wrong pose."""
     assert moving(255 - wall(), wall(), around()).mean() < 0.01
     assert moving(wall(7), wall(), around()).mean() < 0.01
 
 
-def test_what_only_four_other_frames_have_in_their_picture_is_not_known() -> None:
+def test_four_witness_frames_are_not_enough() -> None:
     frame = wall()
     frame[disc(8.0)] = 200, 30, 30
-    away = np.eye(4)
-    away[0, 3] = 100.0
-    far = [Sight(wall(), away, K) for _ in STEPS]
+    far_view = np.eye(4)
+    far_view[0, 3] = 100.0
+    far = [Sight(wall(), far_view, K) for _ in STEPS]
     behind = [Sight(wall(), np.diag([-1.0, 1.0, -1.0, 1.0]), K) for _ in STEPS]
     assert not misfit(sight(frame), INVERSE, wall(), [*around()[:4], *far, *behind], GRID, UNIT, MisfitConfig()).any()
 
 
 def test_the_values_are_those_of_double_precision() -> None:
     frame, shown = noisy(wall(), 8.0, 1), noisy(wall(), 2.0, 2)
-    others = [sight(noisy(wall(), 8.0, seed)) for seed in (3, 4, 5, 6, 7)]
-    median = np.median([other.colors for other in others], axis=0)
+    witnesses = [sight(noisy(wall(), 8.0, seed)) for seed in (3, 4, 5, 6, 7)]
+    median = np.median([witness.colors for witness in witnesses], axis=0)
     gaps = [np.abs(frame.astype(np.float64) - each).max(-1) for each in (shown, median)]
     taps = np.arange(-8, 9)  # OpenCV's kernel for float pictures extends to four sigmas
     kernel = np.exp(-0.5 * (taps / (4.0 * UNIT)) ** 2)
     kernel /= kernel.sum()
     gaps = [cv2.sepFilter2D(gap, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101) for gap in gaps]
     expected = np.minimum(*gaps)
-    found = misfit(sight(frame), INVERSE, shown, others, GRID, UNIT, MisfitConfig())
+    found = misfit(sight(frame), INVERSE, shown, witnesses, GRID, UNIT, MisfitConfig())
     assert np.abs(found - expected / np.quantile(expected, 0.9)).max() < 0.08  # the brightness fit is affected by noise

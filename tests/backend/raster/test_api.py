@@ -40,7 +40,7 @@ def test_a_backend_that_does_not_exist_is_named(tools):
         rasterize(**tools.cloud(5, 8, 8).leaves(), Ks=tools.camera(8, 8, 7.0), width=8, height=8, backend="opengl")
 
 
-def test_a_device_without_a_body_says_so(tools):
+def test_unsupported_device_gives_a_readable_error(tools):
     scene = tools.cloud(5, 8, 8)
     leaves = {name: value.to("meta") for name, value in scene.tensors.items() if name != "viewmats"}
     with pytest.raises(NotImplementedError, match="meta"):

@@ -67,10 +67,10 @@ def test_any_number_of_channels(body, channels):
 @pytest.mark.parametrize("degree", [None, 1, 2])
 def test_cameras_of_a_batch_are_independent_and_their_gradients_add(body, degree):
     scene = cloud(80, 30, 22, seed=4, degree=degree, with_contributions=True, with_top=True)
-    other = scene.tensors["viewmats"].clone()
-    other[0, :3, 3] += torch.tensor([0.3, 0.1, 0.2])
-    away = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))[None] @ scene.tensors["viewmats"]
-    views = torch.cat([scene.tensors["viewmats"], away, other])
+    single = scene.tensors["viewmats"].clone()
+    single[0, :3, 3] += torch.tensor([0.3, 0.1, 0.2])
+    turned = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))[None] @ scene.tensors["viewmats"]
+    views = torch.cat([scene.tensors["viewmats"], turned, single])
     Ks = torch.cat([scene.Ks, scene.Ks, camera(30, 22, 35.0, 12.0, 13.0)])
     batch = Scene(scene.tensors | {"viewmats": views}, Ks, 30, 22, scene.options)
     out, grads = ran(batch, body)
@@ -80,9 +80,9 @@ def test_cameras_of_a_batch_are_independent_and_their_gradients_add(body, degree
     assert relative(out.means2d_grad, ref.means2d_grad) < 1e-3
     for c in range(3):
         one = Scene(scene.tensors | {"viewmats": views[c : c + 1]}, Ks[c : c + 1], 30, 22, scene.options)
-        alone = on_host(one.run(body))
+        single_render = on_host(one.run(body))
         for name in ("colors", "alphas", "radii", "means2d", "weight_sum", "weight_max", "top_ids", "top_weights"):
-            assert torch.equal(getattr(out, name)[c], getattr(alone, name)[0]), name
+            assert torch.equal(getattr(out, name)[c], getattr(single_render, name)[0]), name
 
 
 @on_compiled_bodies

@@ -28,25 +28,25 @@ def test_a_median_depth_is_where_half_is_crossed_or_that_of_the_largest_weight(t
 
 @pytest.mark.parametrize("body", ["cpu", "reference"])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_harmonics_held_apart_are_those_held_together(tools, body, degree):
+def test_split_harmonics_equal_joined_ones(tools, body, degree):
     scene = tools.cloud(300, 50, 41, degree=3)
     together, expected = scene.gradients(body, sh_degree=degree)
     sh = scene.tensors["sh"]
     scene.tensors.update(sh=sh[:, :1].clone(), sh_rest=sh[:, 1:].clone())
-    apart, grads = scene.gradients(body, sh_degree=degree)
-    assert torch.equal(apart.colors, together.colors)
+    split, grads = scene.gradients(body, sh_degree=degree)
+    assert torch.equal(split.colors, together.colors)
     joined = torch.cat([grads.pop("sh"), grads.pop("sh_rest")], dim=1)
     assert torch.equal(joined, expected.pop("sh"))
     assert all(torch.equal(grad, expected[name]) for name, grad in grads.items())
 
 
-@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_gradients_of_what_no_camera_sees_are_zero_whatever_memory_held(tools, cameras, apart):
+def test_gradients_of_invisible_gaussians_are_zero_in_reused_memory(tools, cameras, split):
     scene = tools.cloud(700, 50, 41, degree=2)
     scene.tensors["means"][::3, 2] = -5.0  # behind the camera
     tensors = scene.tensors | {"viewmats": scene.tensors["viewmats"].repeat(cameras, 1, 1)}
-    if apart:
+    if split:
         tensors |= {"sh": tensors["sh"][:, :1].clone(), "sh_rest": tensors["sh"][:, 1:].clone()}
     scene = tools.Scene(tensors, scene.Ks.repeat(cameras, 1, 1), 50, 41, scene.options)
     _, expected = scene.gradients("reference", sh_degree=1)
@@ -59,7 +59,7 @@ def test_gradients_of_what_no_camera_sees_are_zero_whatever_memory_held(tools, c
     assert all((grad[::3] == 0).all() for name, grad in grads.items() if len(grad) == 700)
 
 
-def test_harmonics_held_apart_are_refused_where_they_do_not_fit(tools):
+def test_mismatched_split_harmonics_are_refused(tools):
     scene = tools.cloud(6, 8, 8, degree=1)
     sh = scene.tensors["sh"]
     for first, rest in ((sh, sh[:, 1:]), (sh[:, :1], sh[:, 1:3]), (sh[:, :1], sh[1:, 1:]), (None, sh[:, 1:])):
@@ -69,7 +69,7 @@ def test_harmonics_held_apart_are_refused_where_they_do_not_fit(tools):
             scene.run("cpu", sh_rest=rest)
 
 
-def test_one_thread_and_many_agree_bitwise(tools):
+def test_thread_count_does_not_change_a_bit(tools):
     scene = tools.cloud(3000, 130, 70, degree=1, with_depth=True, with_contributions=True, with_top=True)
     one, one_grads = scene.gradients("cpu", settings=RasterSettings(threads=1))
     for threads in (2, 5):
@@ -82,7 +82,7 @@ def test_one_thread_and_many_agree_bitwise(tools):
             assert torch.equal(grad, many_grads[name]), name
 
 
-def test_of_twins_the_front_one_is_top(tools):
+def test_front_gaussian_of_coincident_ones_is_on_top(tools):
     scene = tools.single(logit=0.0)
     twice = {
         name: torch.cat((value, value))
@@ -105,22 +105,22 @@ def test_workspace_reuse_leaves_no_trace(tools):
     assert all(torch.equal(grad, again_grads[name]) for name, grad in first_grads.items())
 
 
-def test_interleaved_forward_passes_keep_their_own_state(tools):
+def test_interleaved_forward_passes_do_not_share_state(tools):
     a, b = tools.cloud(150, 40, 30, seed=1), tools.cloud(170, 44, 36, seed=2)
-    alone = {}
+    single = {}
     for scene in (a, b):
         leaves = scene.leaves()
         scene.run("cpu", leaves).colors.square().sum().backward()
-        alone[id(scene)] = leaves
+        single[id(scene)] = leaves
     la, lb = a.leaves(), b.leaves()
     out_a, out_b = a.run("cpu", la), b.run("cpu", lb)
     out_a.colors.square().sum().backward()
     out_b.colors.square().sum().backward()
     for scene, leaves in ((a, la), (b, lb)):
-        assert all(torch.equal(leaf.grad, alone[id(scene)][name].grad) for name, leaf in leaves.items())
+        assert all(torch.equal(leaf.grad, single[id(scene)][name].grad) for name, leaf in leaves.items())
 
 
-def test_no_grad_mode_and_other_float_types(tools):
+def test_no_grad_mode_and_float64_work(tools):
     scene = tools.cloud(60, 24, 17)
     with torch.no_grad():
         out = scene.run("cpu")
@@ -134,16 +134,16 @@ def test_no_grad_mode_and_other_float_types(tools):
 
 def test_concurrent_callers_do_not_disturb_each_other(tools):
     scenes = [tools.cloud(400 + 50 * i, 60 + i, 50, seed=i) for i in range(3)]
-    alone = [scene.gradients("cpu") for scene in scenes]
+    single = [scene.gradients("cpu") for scene in scenes]
     with ThreadPoolExecutor(3) as pool:
         together = list(pool.map(lambda i: scenes[i % 3].gradients("cpu"), range(24)))
     for i, (out, grads) in enumerate(together):
-        assert torch.equal(out.colors, alone[i % 3][0].colors)
-        assert all(torch.equal(grad, alone[i % 3][1][name]) for name, grad in grads.items())
+        assert torch.equal(out.colors, single[i % 3][0].colors)
+        assert all(torch.equal(grad, single[i % 3][1][name]) for name, grad in grads.items())
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
-def test_a_forked_child_makes_its_own_threads():
+def test_forked_child_creates_new_threads():
     code = """
 import os, torch
 from torch_backend.raster import RasterSettings, rasterize

@@ -63,7 +63,7 @@ def covering(tools, n=24, width=130, height=90):
     return scene
 
 
-def test_forward_is_deterministic_and_passes_keep_their_own_state(tools, device):
+def test_forward_is_deterministic_and_passes_do_not_share_state(tools, device):
     a = tools.cloud(300, 50, 40, seed=1, degree=1, with_depth=True, with_contributions=True, with_top=True, channels=5)
     b = tools.cloud(170, 44, 36, seed=2)
     first, _ = gradients(a, device)
@@ -72,9 +72,9 @@ def test_forward_is_deterministic_and_passes_keep_their_own_state(tools, device)
     run(b, device).colors.sum().backward()
     again.colors.square().sum().backward()
     assert_same_images(first, on_host(again))
-    other = a.leaves()
-    run(a, device, other).colors.square().sum().backward()
-    assert all(tools.relative(leaf.grad, other[name].grad) < 1e-5 for name, leaf in leaves.items())
+    second = a.leaves()
+    run(a, device, second).colors.square().sum().backward()
+    assert all(tools.relative(leaf.grad, second[name].grad) < 1e-5 for name, leaf in leaves.items())
 
 
 def test_a_camera_that_is_no_number_is_refused_on_fibers_and_sees_nothing_on_a_gpu(tools, device):
@@ -95,8 +95,8 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
     with monkeypatch.context() as short:
         short.setattr(hit_lists, "HITS_MAX", 96)
         small, small_grads = gradients(scene, device)
-    wanted, held = small.hits.tolist()
-    assert held == 96 < wanted, "the list should have been too short"
+    wanted, listed = small.hits.tolist()
+    assert listed == 96 < wanted, "the list should have been too short"
     if GPU:
         torch.cuda.synchronize()  # the demand arrives asynchronously
     large, large_grads = gradients(scene, device)
@@ -116,14 +116,14 @@ def test_the_first_call_of_a_size_lists_all_its_hits(tools, device, monkeypatch)
     monkeypatch.setattr(hit_lists, "HITS_STEP", 1)
     monkeypatch.setattr(hit_lists, "_demands", {})
     with torch.no_grad():
-        wanted, held = run(covering(tools), device).hits.tolist()
-        assert wanted > 4 * 24 and wanted <= held <= wanted * 4 // 3 + 1
+        wanted, listed = run(covering(tools), device).hits.tolist()
+        assert wanted > 4 * 24 and wanted <= listed <= wanted * 4 // 3 + 1
         # Twice as many Gaussians, as after a round of growth, still fit at the first call.
-        wanted, held = run(covering(tools, n=48), device).hits.tolist()
-    assert wanted <= held
+        wanted, listed = run(covering(tools, n=48), device).hits.tolist()
+    assert wanted <= listed
 
 
-def test_kernels_of_a_module_are_made_together(monkeypatch):
+def test_kernels_of_a_module_are_compiled_together(monkeypatch):
     # If a kernel were added later, Warp would unload the others, which CUDA graphs still use.
     wp = initialised_warp()
     monkeypatch.setattr(cuda, "_kernels", {("", 0): cuda._structure(wp)})
@@ -157,7 +157,7 @@ def test_wide_tile_numbers_sort_alike(tools, device, monkeypatch):
     assert_same_images(narrow, on_host(run(scene, device)))
 
 
-def test_too_many_channels_are_refused(tools, device):
+def test_channel_count_above_the_limit_is_refused(tools, device):
     with pytest.raises(ValueError, match="at most 56"):
         run(tools.cloud(3, 9, 9, channels=57), device)
 

@@ -30,7 +30,7 @@ def test_kernels_compile_for_every_architecture(module, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("arch", [75, 120])
-def test_machine_code_is_made_too(arch, tmp_path):
+def test_machine_code_is_compiled(arch, tmp_path):
     name = "raster_blend_backward"
     cuda.build(name, 3)
     (path,) = initialised_warp().compile_aot_module(

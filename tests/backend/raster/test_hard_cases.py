@@ -52,7 +52,7 @@ def test_every_case_is_within_its_bounds(case, body):
 @on_every_body
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "colors"])
-def test_non_finite_gaussian_is_culled_and_the_others_stay(tools, name, bad, body):
+def test_non_finite_gaussian_is_culled_without_affecting_the_rest(tools, name, bad, body):
     keep = torch.arange(40) != 7
     for column in (0, -1) if name == "means" else (-1,):
         scene = tools.cloud(40, 24, 18)
@@ -110,7 +110,7 @@ def test_ssim_sees_no_nan_of_a_poisoned_scene(body):
     assert all(torch.isfinite(leaf.grad).all() for leaf in leaves.values())
 
 
-def test_images_smaller_than_the_window_of_ssim_are_compared_by_l1_alone():
+def test_images_smaller_than_the_ssim_window_use_only_l1():
     for height, width in ((10, 30), (30, 10), (1, 1)):
         image = torch.full((height, width, 3), 0.25, requires_grad=True)
         loss = losses.photometric(image, torch.full_like(image, 0.75), 0.2)

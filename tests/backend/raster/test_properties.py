@@ -17,7 +17,7 @@ from benchmarks.raster_errors import BODIES, PER_GAUSSIAN, SAME_SIDE, Scene, cam
 from torch_backend.raster import RasterSettings
 from torch_backend.raster.constants import ALPHA_MIN
 
-ASKED = int(os.environ.get("SPLANNEQUIN_CASES", "0"))
+REQUESTED_CASES = int(os.environ.get("SPLANNEQUIN_CASES", "0"))
 SHARE = {"cpu": 1.0, "reference": 0.25, "reference32": 0.25, "cuda": 0.05, "gpu": 0.5}
 """Cases per implementation relative to the CPU's, by speed."""
 on_every_body = pytest.mark.parametrize("body", BODIES)
@@ -27,7 +27,7 @@ def for_all(strategy, body, usual, generated, holds):
     """Assert `holds(example)` for `usual` (or SPLANNEQUIN_CASES) examples, times the implementation's share."""
 
     @settings(
-        max_examples=max(5, round(SHARE[body] * (ASKED or usual))),
+        max_examples=max(5, round(SHARE[body] * (REQUESTED_CASES or usual))),
         suppress_health_check=list(HealthCheck),
     )
     @given(strategy)
@@ -215,13 +215,13 @@ def assert_sane(scene, out, grads):
             assert (grad[culled.all(0)] == 0).all(), name
 
 
-def assert_alike(one, other, count, bound=2e-3):
+def assert_alike(first, second, count, bound=2e-3):
     """Assert that two images of `count` Gaussians are equal within `bound`, except for alphas near the threshold of
     1/255."""
-    gap = (one.alphas - other.alphas).abs()
+    gap = (first.alphas - second.alphas).abs()
     same = gap < SAME_SIDE
     assert (gap <= count * ALPHA_MIN + bound).all()
-    assert ((one.colors - other.colors).abs()[same] <= bound * (1 + one.colors.abs().max())).all()
+    assert ((first.colors - second.colors).abs()[same] <= bound * (1 + first.colors.abs().max())).all()
 
 
 @on_every_body
@@ -305,14 +305,14 @@ def test_order_of_the_gaussians_changes_nothing(body, generated):
         order = torch.randperm(len(scene.tensors["means"]), generator=torch.Generator().manual_seed(seed))
         shuffled = {k: v[order] if k in PER_GAUSSIAN else v for k, v in scene.tensors.items()}
         out, grads = run(scene, body)
-        other, other_grads = run(Scene(shuffled, scene.Ks, scene.width, scene.height, scene.options), body)
-        assert torch.allclose(out.colors, other.colors, rtol=1e-5, atol=1e-6)
-        assert torch.equal(out.radii[:, order], other.radii)
-        assert torch.allclose(out.weight_sum[:, order], other.weight_sum, rtol=1e-4, atol=1e-6)
+        second, second_grads = run(Scene(shuffled, scene.Ks, scene.width, scene.height, scene.options), body)
+        assert torch.allclose(out.colors, second.colors, rtol=1e-5, atol=1e-6)
+        assert torch.equal(out.radii[:, order], second.radii)
+        assert torch.allclose(out.weight_sum[:, order], second.weight_sum, rtol=1e-4, atol=1e-6)
         for name in PER_GAUSSIAN:
             if name in grads:
                 scale = float(grads[name].abs().max())
-                assert torch.allclose(grads[name][order], other_grads[name], rtol=1e-3, atol=1e-5 * (1 + scale)), name
+                assert torch.allclose(grads[name][order], second_grads[name], rtol=1e-3, atol=1e-5 * (1 + scale)), name
 
     for_all(st.tuples(good_scenes(), st.integers(0, 1000)), body, 150, generated, holds)
 
@@ -348,8 +348,8 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(body, generate
         view[:, :3, :3] = view[:, :3, :3] @ R.T
         view[:, :3, 3] -= view[:, :3, :3] @ t
         moved = scene.tensors | {"means": scene.tensors["means"] @ R.T + t, "quats": quats, "viewmats": view}
-        other = Scene(moved, scene.Ks, scene.width, scene.height, scene.options).run(body)
-        assert_alike(scene.run(body), other, len(quats))
+        second = Scene(moved, scene.Ks, scene.width, scene.height, scene.options).run(body)
+        assert_alike(scene.run(body), second, len(quats))
 
     flat = good_scenes(bands=st.sampled_from([(None, 3), (0, 3)]))  # higher harmonics depend on the world's axes
     turns = st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT)
@@ -370,11 +370,11 @@ def test_scaling_the_world_scales_the_depth(body, generated):
         }
         near = [dataclasses.replace(scene.options["settings"], near=NEAR * f) for f in (1, factor)]
         options = [scene.options | {"with_depth": True, "settings": value} for value in near]
-        one = Scene(scene.tensors, scene.Ks, scene.width, scene.height, options[0]).run(body)
-        other = Scene(scaled, scene.Ks, scene.width, scene.height, options[1]).run(body)
-        assert_alike(one, other, len(view) * len(scene.tensors["means"]))
-        solid = (one.alphas > 0.2) & ((one.alphas - other.alphas).abs() < SAME_SIDE)
-        assert torch.allclose(one.depth_expected[solid] * factor, other.depth_expected[solid], rtol=5e-3)
+        first = Scene(scene.tensors, scene.Ks, scene.width, scene.height, options[0]).run(body)
+        second = Scene(scaled, scene.Ks, scene.width, scene.height, options[1]).run(body)
+        assert_alike(first, second, len(view) * len(scene.tensors["means"]))
+        solid = (first.alphas > 0.2) & ((first.alphas - second.alphas).abs() < SAME_SIDE)
+        assert torch.allclose(first.depth_expected[solid] * factor, second.depth_expected[solid], rtol=5e-3)
 
     for_all(st.tuples(good_scenes(), st.floats(-5, 5)), body, 150, generated, holds)
 
@@ -429,16 +429,16 @@ def test_footprints_at_the_frustum_edge_are_bounded(body, generated):
 
 
 @on_every_body
-def test_a_camera_of_a_batch_sees_what_it_sees_alone(body, generated):
+def test_batched_camera_equals_a_single_camera(body, generated):
     def holds(scene):
         scene.Ks[1, [0, 1], [0, 1]] *= 1.25
         both, grads = squared(scene)
         totals = {name: torch.zeros_like(grad) for name, grad in grads.items()}
         for c in range(2):
             tensors = scene.tensors | {"viewmats": scene.tensors["viewmats"][c : c + 1]}
-            alone, part = squared(Scene(tensors, scene.Ks[c : c + 1], scene.width, scene.height, scene.options))
-            assert torch.equal(both.colors[c], alone.colors[0])
-            assert torch.equal(both.radii[c], alone.radii[0])
+            single, part = squared(Scene(tensors, scene.Ks[c : c + 1], scene.width, scene.height, scene.options))
+            assert torch.equal(both.colors[c], single.colors[0])
+            assert torch.equal(both.radii[c], single.radii[0])
             for name, total in totals.items():
                 (total[c : c + 1] if name == "viewmats" else total).add_(part[name])
         for name, total in totals.items():

@@ -120,14 +120,14 @@ def test_any_number_of_threads_gives_the_same_bits(height, width):
 
     value, gradient = run(1)
     for threads in (2, 3, 8):
-        again, other = run(threads)
+        again, second = run(threads)
         assert torch.equal(value, again)
-        assert torch.equal(gradient, other)
+        assert torch.equal(gradient, second)
 
 
 def test_callers_in_several_threads_do_not_mix():
     pairs = [pair(40 + 3 * i, 50, 3) for i in range(4)]
-    alone = [ssim(x, y, 2) for x, y in pairs]
+    single = [ssim(x, y, 2) for x, y in pairs]
     together: list[torch.Tensor | None] = [None] * len(pairs)
 
     def work(i):
@@ -139,7 +139,7 @@ def test_callers_in_several_threads_do_not_mix():
         worker.start()
     for worker in workers:
         worker.join()
-    assert all(torch.equal(a, b) for a, b in zip(alone, together))
+    assert all(torch.equal(a, b) for a, b in zip(single, together))
 
 
 def test_sizes_may_alternate():
@@ -152,9 +152,9 @@ def test_sizes_may_alternate():
 
 def test_strided_images():
     image, target = pair(24, 31, 3)
-    apart = image.permute(2, 0, 1).contiguous().permute(1, 2, 0)
-    assert not apart.is_contiguous()
-    assert torch.equal(ssim(apart, target), ssim(image, target))
+    strided = image.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    assert not strided.is_contiguous()
+    assert torch.equal(ssim(strided, target), ssim(image, target))
 
 
 def test_equal_images_score_one_with_no_gradient():

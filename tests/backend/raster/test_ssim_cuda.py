@@ -46,7 +46,7 @@ def test_refuses_what_it_cannot_do():
 
 
 @pytest.mark.parametrize("arch", [75, 90, 120])
-def test_kernels_compile_for_gpus_that_are_not_here(tmp_path, arch):
+def test_kernels_compile_for_absent_gpus(tmp_path, arch):
     """NVRTC is part of Warp, so GPU code compiles without a GPU; this includes Adam's kernel."""
     wp = initialised_warp()
     for kernel in (ssim_cuda.kernel(), adam._kernel()):

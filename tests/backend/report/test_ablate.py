@@ -15,10 +15,10 @@ from benchmarks.ablate.__main__ import Ablation, tables
 from benchmarks.ablate.cases import TUNED_AT, Case, drawn, pairs_of
 from benchmarks.ablate.instants import Instants, digest
 from benchmarks.ablate.measures import FrameMaker, summary
-from benchmarks.ablate.switches import COMBINATIONS, FRAME, RULES, detail_config, replaced, switched_off, variants
+from benchmarks.ablate.switches import COMBINATIONS, FRAME, RULES, detail_config, replaced, rules_disabled, variants
 from benchmarks.ablate.table import TRUTH, Store, sweep_table, table
 from benchmarks.detail_clip import open_clip
-from benchmarks.other_state import OTHER, Painted, Pair, Polygon
+from benchmarks.other_state import CHANGED, Painted, Pair, Polygon
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def instants(clip):
     return Instants(clip, clip.run.train_frames[6])
 
 
-def held(switch):
+def current_value(switch):
     found = importlib.import_module(f"torch_backend.freeze.{switch.module}")
     for name in switch.name.split("."):
         found = getattr(found, name)
@@ -39,12 +39,12 @@ def held(switch):
 
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=lambda rule: rule.name)
-def test_a_rule_is_off_and_on_again(rule):
-    before = [held(switch) for switch in rule.switches]
-    with pytest.raises(ArithmeticError), switched_off(frozenset({rule.name})):
-        assert all(held(switch) is not was for switch, was in zip(rule.switches, before, strict=True))
+def test_disabled_rule_is_restored(rule):
+    before = [current_value(switch) for switch in rule.switches]
+    with pytest.raises(ArithmeticError), rules_disabled(frozenset({rule.name})):
+        assert all(current_value(switch) is not was for switch, was in zip(rule.switches, before, strict=True))
         raise ArithmeticError  # restored even if the measurement fails
-    assert [held(switch) for switch in rule.switches] == before
+    assert [current_value(switch) for switch in rule.switches] == before
     config = detail_config(frozenset({rule.name}))
     assert all(functools.reduce(getattr, name.split("."), config) == value for name, value in rule.numbers.items())
     assert rule.switches or rule.numbers
@@ -61,25 +61,25 @@ def test_groups_of_variants():
         variants(("bent",))
 
 
-def brightened(step, made=None):
-    """Develop step that also brightens the scene, so that it has an effect on every CPU; `made` counts its calls."""
+def brightened(step, counts=None):
+    """Develop step that also brightens the scene, so that it has an effect on every CPU; `counts` counts its calls."""
 
     def brighten(*args, **more):
-        if made is not None:
-            made["develop"] += 1
+        if counts is not None:
+            counts["develop"] += 1
         frozen = step(*args, **more)
         return dataclasses.replace(frozen, state={**frozen.state, "sh0": frozen.state["sh0"] + 0.05})
 
     return brighten
 
 
-def test_steps_that_variants_share_are_made_once(instants, clip):
+def test_shared_steps_of_variants_run_once(instants, clip):
     """Switching `develop` off reuses the earlier steps; switching a frame rule off reuses all steps."""
-    made = Counter[str]()
-    with replaced("instant.repairs", "develop", functools.partial(brightened, made=made)):
+    counts = Counter[str]()
+    with replaced("instant.repairs", "develop", functools.partial(brightened, counts=counts)):
         today = instants.make(frozenset())
         assert instants.make(frozenset({next(n for n, r in RULES.items() if r.stage == FRAME)})).key == today.key
-    assert made == {"develop": 1}
+    assert counts == {"develop": 1}
     plain = instants.make(frozenset({"develop"}))
     assert plain.key != today.key and plain.frozen.descent is not None
     assert torch.equal(plain.frozen.state["means"], plain.frozen.descent.state["means"])
@@ -114,8 +114,8 @@ def test_what_was_measured_is_not_measured_again(clip, tmp_path):
     first = {path: path.stat().st_mtime_ns for path in store.folder.rglob("*.json")}
     assert {path.stem for path in first} == {"today", "no-residuals", "no-develop"}
     assert list((tmp_path / "kept").glob("develop-*.safetensors"))
-    told = "\n".join(tables(store))
-    assert "| no residuals | " in told and "| no develop | 1 of 1 | " in told and told.endswith("tiny 107.")
+    text = "\n".join(tables(store))
+    assert "| no residuals | " in text and "| no develop | 1 of 1 | " in text and text.endswith("tiny 107.")
     Ablation(store, tmp_path / "kept", args).run([case])
     assert {path: path.stat().st_mtime_ns for path in store.folder.rglob("*.json")} == first
 
@@ -138,12 +138,12 @@ def test_differences_are_of_instants_that_both_variants_have():
 
     rows = [record("today", 1, 30.0), record("today", 2, 20.0), record("no x", 1, 30.5), record("no x", 3, 90.0)]
     assert summary(rows[0])["recall"] == 0.25 and summary(rows[0])["delivered whole"] == 30.0
-    told = table([*rows, record("no y", 1, 30.0, 2.0)], TRUTH)
-    assert told[2].startswith("| **today** | 2 instants | 25.00 ± 7.07 |")
-    assert told[3].startswith("| no x | 1 of 1 | +0.50 |") and told[4].startswith("| no y | 0 of 1 | +0.00 |")
+    lines = table([*rows, record("no y", 1, 30.0, 2.0)], TRUTH)
+    assert lines[2].startswith("| **today** | 2 instants | 25.00 ± 7.07 |")
+    assert lines[3].startswith("| no x | 1 of 1 | +0.50 |") and lines[4].startswith("| no y | 0 of 1 | +0.00 |")
     assert not sweep_table(rows)
-    told = sweep_table([*rows, record("half z", 1, 29.0), record("half z", 2, 20.5), record("twice z", 2, 21.5)])
-    assert told[2:] == ["| z | -0.25 | – | – | – | – | +1.50 | – | – | – | – |"]
+    lines = sweep_table([*rows, record("half z", 1, 29.0), record("half z", 2, 20.5), record("twice z", 2, 21.5)])
+    assert lines[2:] == ["| z | -0.25 | – | – | – | – | +1.50 | – | – | – | – |"]
 
 
 def test_digests_tell_content_and_not_objects():
@@ -152,10 +152,12 @@ def test_digests_tell_content_and_not_objects():
     assert len({digest([a]), digest([a.double()]), digest([a[:2]]), digest([a + 1]), digest([])}) == 5
 
 
-def test_what_is_let_go_is_held_against_what_was_painted(clip, tmp_path, monkeypatch):
+def test_rejected_pixels_are_scored_against_painted_masks(clip, tmp_path, monkeypatch):
     """The whole plate is painted as another state, so the removed fraction of a frame is its IoU."""
     t_star, frame = clip.run.train_frames[6], clip.run.train_frames[2]
-    whole = Polygon(np.array([(0, 0), (clip.width, 0), (clip.width, clip.height), (0, clip.height)], float), "", OTHER)
+    whole = Polygon(
+        np.array([(0, 0), (clip.width, 0), (clip.width, clip.height), (0, clip.height)], float), "", CHANGED
+    )
     painted = Painted("tiny", "", clip.width, clip.height, (Pair(t_star, frame, 0, (whole,)),))
     case, store = Case("tiny", clip, [], None), Store(tmp_path)
     masks.judge_masks(case, store)

@@ -41,11 +41,11 @@ def done(tmp_path_factory, scene):
     results = tmp_path_factory.mktemp("results")
     runs, said = plan([f"truth:{scene[0]}"], results, **SIZE)
     runs = only(runs, ("auto", "support"), ("static", "none"))
-    assert run_plan([*runs, asked_otherwise(runs)], results, 2) == []
+    assert run_plan([*runs, frozen_at_t_star(runs)], results, 2) == []
     return results, runs, said
 
 
-def asked_otherwise(runs):
+def frozen_at_t_star(runs):
     auto = only(runs, ("auto", "support"))[0]
     return dataclasses.replace(auto, query="plain", variant="frozen at t* itself")
 
@@ -63,9 +63,9 @@ def test_the_plan_is_every_host_with_and_without_and_says_what_is_missing(scene,
     assert {"no hidden loss", "no defective loss", "no confidence weighting", "no exposure"} <= variants
     assert len(variants) + sum("ablation" in s for s in said) == len({a.name for a in ABLATIONS})
     main = {r.run_name for r in runs if r.variant == "default"}
-    asked = [r for r in runs if r.variant.startswith("frozen")]
-    assert {r.supervision for r in asked} == {"none", "paper", "support"}
-    assert {r.run_name for r in asked} <= main  # trained once, queried twice
+    frozen_runs = [r for r in runs if r.variant.startswith("frozen")]
+    assert {r.supervision for r in frozen_runs} == {"none", "paper", "support"}
+    assert {r.run_name for r in frozen_runs} <= main  # trained once, queried twice
     assert not only(plan([f"truth:{scene[0]}"], tmp_path)[0], ("auto", "none"))
 
 
@@ -121,23 +121,29 @@ def test_a_record_holds_every_frame_and_its_regions(done, scene):
         static = {shown: record.as_shown(shown).values("psnr_db", "static") for shown in record.detailed}
         gains = [value - static[WITHHELD][key] for key, value in static[DELIVERED].items()]
         assert sum(gains) > 0 and "detail" not in record.missing
-        alone = record.values("psnr_db", "static")
-        gains = [value - alone[key] for key, value in static[DEVELOPED].items()]
+        splats_psnr = record.values("psnr_db", "static")
+        gains = [value - splats_psnr[key] for key, value in static[DEVELOPED].items()]
         assert sum(gains) > len(gains), "a run of 60 steps has a lot to gain"
-        made = record.detailed[DELIVERED]
-        assert made.frozen_fps > 0 and made.pictures and all((results / p.ours).is_file() for p in made.pictures)
-        assert not {p.ours for p in made.pictures} & {p.ours for p in record.pictures}
-        one, other = record.two_instants
-        assert one.pose == other.pose and {one.t_star, other.t_star} == set(truth.t_stars) == {*map(int, record.plates)}
+        delivered = record.detailed[DELIVERED]
+        assert (
+            delivered.frozen_fps > 0
+            and delivered.pictures
+            and all((results / p.ours).is_file() for p in delivered.pictures)
+        )
+        assert not {p.ours for p in delivered.pictures} & {p.ours for p in record.pictures}
+        first, second = record.two_instants
+        assert first.pose == second.pose and {first.t_star, second.t_star} == set(truth.t_stars) == {
+            *map(int, record.plates)
+        }
 
 
-def test_runs_that_share_a_training_come_one_after_the_other_and_train_once(done):
+def test_runs_sharing_a_training_are_adjacent_and_train_once(done):
     results, runs, _ = done
-    spec, other = only(runs, ("auto", "support"))[0], asked_otherwise(runs)
-    nearest, plain = (load_record(results / f"{s.run_id}.json") for s in (spec, other))
+    spec, variant = only(runs, ("auto", "support"))[0], frozen_at_t_star(runs)
+    nearest, plain = (load_record(results / f"{s.run_id}.json") for s in (spec, variant))
     assert (nearest.query, plain.query) == ("nearest", "plain")
     assert (plain.train_seconds, plain.threads) == (nearest.train_seconds, nearest.threads)
-    logs = [(results / "logs" / f"{s.run_id}.txt").read_text() for s in (spec, other)]
+    logs = [(results / "logs" / f"{s.run_id}.txt").read_text() for s in (spec, variant)]
     assert "already trained" not in logs[0] and "already trained" in logs[1]
 
 
@@ -154,7 +160,7 @@ def test_published_settings_are_what_is_trained(scene, tmp_path):
     assert config_from_json(trained) == spec.config()
 
 
-def test_the_last_third_of_a_run_has_a_pace_of_its_own(tmp_path):
+def test_pace_is_measured_in_the_last_third_of_a_run(tmp_path):
     # Ten measurements of 100 steps: 20 ms per step, then 50 ms from the 7th on; an interruption repeated the 8th.
     rows = [{"iteration": 100 * n, "seconds": 2.0 * min(n, 6) + 5.0 * max(0, n - 6)} for n in range(1, 11)]
     rows.insert(7, {"iteration": 800, "seconds": 99.0})
@@ -199,8 +205,8 @@ def test_killed_twice_it_ends_as_if_it_had_not_been(done, tmp_path, write_truth)
     assert run_plan(specs, again, 2) == []
     for spec in specs:
         assert not working(spec.run_id)
-        one, other = (load_record(place / f"{spec.run_id}.json") for place in (results, again))
-        for a, b in zip(one.rows, other.rows, strict=True):
+        first, second = (load_record(place / f"{spec.run_id}.json") for place in (results, again))
+        for a, b in zip(first.rows, second.rows, strict=True):
             assert b.value("psnr_db") == pytest.approx(a.value("psnr_db"), abs=0.01)
             assert b.regions.keys() == a.regions.keys()
 
@@ -211,7 +217,7 @@ def working(run_id: str) -> bool:
     return any(run_id in line and "--work" in line for line in found.stdout.splitlines())
 
 
-def test_a_run_that_fails_is_told_and_the_rest_goes_on(scene, tmp_path):
+def test_failed_run_is_reported_and_others_continue(scene, tmp_path):
     runs, _ = plan([f"truth:{scene[0]}"], tmp_path, **SIZE)
     bad = dataclasses.replace(only(runs, ("static", "none"))[0], overrides={"sh_degree": "two"})
     failures = run_plan([bad], tmp_path)

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks import detail, detail_cost, detail_flow, detail_truth
 from benchmarks.detail_clip import VARIANTS, open_clip
-from benchmarks.other_state import OTHER, Painted, Pair, Polygon, score
-from benchmarks.other_state import __main__ as other_state
+from benchmarks.other_state import CHANGED, Painted, Pair, Polygon, score
+from benchmarks.other_state import __main__ as other_state_main
 from torch_backend.footage.images import read_png
 from torch_backend.footage.plates import Plates
 from torch_backend.shot import Shot, write_json
@@ -24,11 +24,11 @@ def shot(trained):
 def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tmp_path):
     clip = open_clip(shot.root)
     assert (clip.width, clip.height) == (64, 48) and len(clip.held_out()) == 1
-    suggested, other = clip.instants()
-    assert abs(suggested - other) >= 7 and {suggested, other} <= set(clip.run.train_frames)
+    suggested, second_instant = clip.instants()
+    assert abs(suggested - second_instant) >= 7 and {suggested, second_instant} <= set(clip.run.train_frames)
     frames = [*clip.held_out(), clip.frames[3], clip.frames[12]]
-    found = detail.judge(clip, [suggested, other], frames, tmp_path / "strips", worst=1)
-    assert [f["t_star"] for f in found["freezes"]] == [suggested, other]
+    found = detail.judge(clip, [suggested, second_instant], frames, tmp_path / "strips", worst=1)
+    assert [f["t_star"] for f in found["freezes"]] == [suggested, second_instant]
     for freeze in found["freezes"]:
         mean = freeze["mean"]
         still = [mean[variant]["still_db"] for variant in VARIANTS]
@@ -41,13 +41,13 @@ def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tm
     strips = list((tmp_path / "strips").glob("*.png"))
     assert len(strips) == 2 and read_png(strips[0]).shape == (48, 5 * 64, 3)
     assert len(detail.table("tiny", found)) == 2 + 12 + 2
-    alone = detail.judge(open_clip(shot.root, develop=False), [suggested], frames[:1])["freezes"][0]["mean"]
+    only_first = detail.judge(open_clip(shot.root, develop=False), [suggested], frames[:1])["freezes"][0]["mean"]
     first = found["freezes"][0]["frames"][0]
-    assert list(alone) == ["splats", "withheld", "delivered"]
-    assert alone["splats"]["still_db"] == pytest.approx(first["splats"]["still_db"], abs=0.01)
+    assert list(only_first) == ["splats", "withheld", "delivered"]
+    assert only_first["splats"]["still_db"] == pytest.approx(first["splats"]["still_db"], abs=0.01)
 
 
-def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
+def test_movers_of_the_plates_are_static_in_the_freeze(shot):
     """At a width of 320 the patch moves by up to 7 pixels per frame in the plates, but not in the frozen frames."""
     clip = open_clip(shot.root, width=320, develop=False)
     t_star = clip.frames[8]
@@ -66,13 +66,13 @@ def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
 def test_what_is_let_go_of_is_scored_against_painted_masks(shot, capsys, tmp_path):
     clip = open_clip(shot.root, develop=False)
     t_star, frame = clip.frames[8], clip.frames[12]
-    whole = Polygon(np.array([(0, 0), (64, 0), (64, 48), (0, 48)], float), "everything", OTHER)
+    whole = Polygon(np.array([(0, 0), (64, 0), (64, 48), (0, 48)], float), "everything", CHANGED)
     pairs = (Pair(t_star, t_star, 2, (whole,)), Pair(t_star, frame, 2, (whole,)), Pair(t_star, frame, 2, ()))
-    itself, all_other, all_same = (row.counts["delivered"] for row in score(clip, Painted("tiny", "", 64, 48, pairs)))
+    itself, all_changed, all_same = (row.counts["delivered"] for row in score(clip, Painted("tiny", "", 64, 48, pairs)))
     assert itself.recall == 0.0, "plate t* shows t*"
-    assert all_other.recall is not None and 0.02 < all_other.recall < 0.9, "the patch moved, the rest did not"
-    assert all_same.extra == all_other.both and all_same.right == all_other.missed
-    assert other_state.main([str(shot.root), "--results", str(tmp_path)]) == 1
+    assert all_changed.recall is not None and 0.02 < all_changed.recall < 0.9, "the patch moved, the rest did not"
+    assert all_same.extra == all_changed.both and all_same.right == all_changed.missed
+    assert other_state_main.main([str(shot.root), "--results", str(tmp_path)]) == 1
     assert "no masks were painted" in capsys.readouterr().err
 
 
@@ -109,19 +109,19 @@ def test_costs_are_of_plates_of_that_size(shot, tmp_path):
     assert (found["width"], found["height"]) == (128, 96) == tuple(found["plates"])
     assert [row["frame"] for row in found["frames"]] == poses and found["peak_mb"] >= found["before_mb"] > 100
     assert all(row["whole"] > row["splats"] > 0 for row in found["frames"]) and set(poses) & set(found["plates_used"])
-    told = detail_cost.table([found | {"summary": detail_cost.summary(found)}])
-    assert told[-1].startswith("| 128x96 | 2 | ")
+    lines = detail_cost.table([found | {"summary": detail_cost.summary(found)}])
+    assert lines[-1].startswith("| 128x96 | 2 | ")
     with pytest.raises(RuntimeError, match="256 pixels could not be measured: .*other"):
         detail_cost.in_child(large, "other", 256, poses)
 
 
 def test_costs_are_those_of_the_later_half():
     rows = [{"whole": s, "splats": 0.1} for s in (9.0, 5.0, 1.0, 2.0, 3.0)]
-    told = detail_cost.summary({"frames": rows})
-    assert (told["first"], told["median"], told["least"], told["most"]) == (9.0, 2.0, 1.0, 3.0)
+    summary = detail_cost.summary({"frames": rows})
+    assert (summary["first"], summary["median"], summary["least"], summary["most"]) == (9.0, 2.0, 1.0, 3.0)
 
 
-def test_means_and_gains_are_told_by_region():
+def test_means_and_gains_are_reported_by_region():
     def pose(splats: float, withheld: float, delivered: float, moving: float | None) -> dict:
         values = splats, splats + 1, withheld, delivered
         regions = {
@@ -145,15 +145,15 @@ def test_means_and_gains_are_told_by_region():
     json.dumps(mean)
 
 
-def test_how_much_of_a_small_mover_is_there_is_told_of_all_poses_and_of_the_worst():
+def test_recall_of_small_movers_is_reported_overall_and_for_the_worst_pose():
     def pose(found: int, should: int) -> dict:
         return {detail_truth.RECALLED: {v: {"arm": [found, should]} for v in detail_truth.VARIANTS}}
 
-    nowhere = {detail_truth.RECALLED: {v: {} for v in detail_truth.VARIANTS}}
-    there = detail_truth.recalls([pose(90, 100), pose(30, 60), pose(0, 5), nowhere])
-    assert there == {"arm": dict.fromkeys(detail_truth.VARIANTS, (120 / 165, 0.5))}, "five pixels are no worst pose"
+    without_object = {detail_truth.RECALLED: {v: {} for v in detail_truth.VARIANTS}}
+    recalls = detail_truth.recalls([pose(90, 100), pose(30, 60), pose(0, 5), without_object])
+    assert recalls == {"arm": dict.fromkeys(detail_truth.VARIANTS, (120 / 165, 0.5))}, "five pixels are no worst pose"
     row = "| room | arm | 0.727 / 0.500 -> 0.727 / 0.500 -> 0.727 / 0.500 -> 0.727 / 0.500 |"
-    assert detail_truth.recall_table({"room": there})[-1] == row
+    assert detail_truth.recall_table({"room": recalls})[-1] == row
     few = detail_truth.recalls([pose(0, 0)])
     assert detail_truth.recall_table({"room": few})[-1] == f"| room | arm | {' -> '.join(['– / –'] * 4)} |"
-    assert detail_truth.recall_table({"room": detail_truth.recalls([nowhere])}) == []
+    assert detail_truth.recall_table({"room": detail_truth.recalls([without_object])}) == []

@@ -9,18 +9,18 @@ from torch_backend.train.device import cuda_refusal
 
 
 def test_a_dry_run_goes_through_all_parts_of_a_stage(world, tmp_path):
-    there = sorted(world.shot.root.rglob("*"))
+    contents = sorted(world.shot.root.rglob("*"))
     assert gpu.main(["limits", "--dry-run", "--shot", str(world.shot.root), "--results", str(tmp_path)]) == 0
-    told = json.loads((tmp_path / "gpu-limits.json").read_text())
-    assert told["dry_run"] and set(told["found"]) == {"memory_6", "resume", "freeze", "live"}
-    assert not [name for name, part in told["found"].items() if "failed" in part]
-    before, after = told["found"]["resume"]["cpu"]["gaussians"]
+    report = json.loads((tmp_path / "gpu-limits.json").read_text())
+    assert report["dry_run"] and set(report["found"]) == {"memory_6", "resume", "freeze", "live"}
+    assert not [name for name, part in report["found"].items() if "failed" in part]
+    before, after = report["found"]["resume"]["cpu"]["gaussians"]
     assert after > before, "it was resumed at a round of growth"
-    assert told["found"]["memory_6"]["fits"]
-    assert sorted(world.shot.root.rglob("*")) == there, "the shot itself is left alone"
+    assert report["found"]["memory_6"]["fits"]
+    assert sorted(world.shot.root.rglob("*")) == contents, "the shot itself is left alone"
 
 
-def test_a_part_that_fails_is_a_sentence_and_the_others_go_on(tmp_path):
+def test_failed_part_is_reported_and_others_continue(tmp_path):
     stage = gpu.Stage(True, None, tmp_path)
     stage.part("without a shot", lambda: {"frames": stage.scratch_shot()})
     stage.part("after it", lambda: {"ms": 1.0})
@@ -31,7 +31,7 @@ def test_a_part_that_fails_is_a_sentence_and_the_others_go_on(tmp_path):
     assert "30 are needed" in stage.found["too late"]["left_out"]
 
 
-def test_parts_can_be_asked_for_by_name(tmp_path):
+def test_parts_can_be_selected_by_name(tmp_path):
     assert gpu.main(["raster", "--dry-run", "--only", "host", "planes", "--results", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "gpu-raster.json").read_text())["found"]
     assert set(found) == {"peer", "host", "planes"}

@@ -45,7 +45,7 @@ def test_identical_pictures_have_finite_scores(noisy):
     assert all(whole[name] in (None, 0.0) for name in ("st_lpips", "flip"))
 
 
-def test_a_region_is_judged_by_its_own_pixels():
+def test_region_metrics_use_only_region_pixels():
     truth = torch.zeros(40, 40, 3)
     image = truth.clone()
     image[:, :20] = 0.1
@@ -178,7 +178,7 @@ def test_a_clear_gain_is_a_win_and_its_mirror_a_loss():
     assert paired(a, b, more_is_better=False).verdict == "loss"
 
 
-def test_runs_that_disagree_decide_nothing_however_many_frames_they_have():
+def test_disagreeing_runs_are_undecided_for_any_frame_count():
     """Two runs differ by +3, two by -1: 400 frames suggest +1 with a tiny error, the four runs do not."""
     result = paired(rows(1.0, frames=100, spread=2.0, noise=0.01), rows(0.0, frames=100))
     assert result.mean > 5 * result.frame_se

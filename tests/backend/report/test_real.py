@@ -35,7 +35,7 @@ def test_unknown_pixels_are_neither_moving_nor_static(shot):
     assert bool((found["static"] == (labels == STILL)).all())
 
 
-def test_rigid_pixels_keep_eight_pixels_away_from_movers(tmp_path):
+def test_rigid_pixels_are_eight_pixels_from_movers(tmp_path):
     shot = Shot.create(tmp_path / "wide.splannequin")
     shot.update(width=640, height=12)
     labels = painted(shot, 1)

@@ -114,7 +114,7 @@ def report(results):
     return results / "report"
 
 
-def test_a_record_comes_back_as_it_went(results):
+def test_record_round_trips(results):
     path = next(results.glob("*.json"))
     record = load_record(path)
     save_record(results / "copy", record)
@@ -163,19 +163,21 @@ def test_every_table_has_a_row_of_what_is_delivered(results):
             assert any(row[0].split(" against ")[0] == f"auto (ours), {kind}" for row in table.rows), (title, kind)
     regions = {row[0]: row[1:] for row in tables["By region"].rows}
     for kind, gain in zip(kinds, (1.0, 2.0, 4.0), strict=True):
-        for alone, made in zip(regions["auto (ours)"], regions[f"auto (ours), {kind}"], strict=True):
-            assert float(made) - float(alone) == pytest.approx(gain, abs=0.011)
-    won = [row for row in tables["Who wins"].rows if row[0] == "auto (ours), plate detail against auto (ours)"]
+        for splats, detailed in zip(regions["auto (ours)"], regions[f"auto (ours), {kind}"], strict=True):
+            assert float(detailed) - float(splats) == pytest.approx(gain, abs=0.011)
+    won = [
+        row for row in tables["Paired comparisons"].rows if row[0] == "auto (ours), plate detail against auto (ours)"
+    ]
     assert [row[1] for row in won] == ["whole frame", "seen at t*", "never seen at t*", "moving", "static"]
     assert all(row[2] == "frozen frame 80.00" and row[3] == "+4.000" and row[-1] == "win" for row in won)
-    cost = {row[0]: row for row in tables["What it cost (synthetic scenes)"].rows}
-    fps, held = (tables["What it cost (synthetic scenes)"].header.index(n) for n in ("frozen frames / s", "moving"))
+    cost = {row[0]: row for row in tables["Cost (synthetic scenes)"].rows}
+    fps, moving = (tables["Cost (synthetic scenes)"].header.index(n) for n in ("frozen frames / s", "moving"))
     assert cost["auto (ours), plate detail"][fps] == "3.0" and cost["auto (ours)"][fps] == "240.0"
     # A run's own frames at their own times are not frozen frames.
-    assert cost["auto (ours), plate detail"][held] == "–" != cost["auto (ours)"][held]
+    assert cost["auto (ours), plate detail"][moving] == "–" != cost["auto (ours)"][moving]
 
 
-def test_an_ablation_is_held_against_splats_alone(results, tmp_path):
+def test_ablation_is_compared_with_splats_only(results, tmp_path):
     record = load_record(next(results.glob("*auto*.json")))
     record.pictures, record.two_instants, record.detailed[DELIVERED].pictures = [], [], []
     save_record(tmp_path, record)
@@ -186,7 +188,7 @@ def test_an_ablation_is_held_against_splats_alone(results, tmp_path):
 
 
 def test_who_wins_where_and_at_what_cost(results):
-    table = next(t for t in all_tables(load_records(results)) if t.title == "Who wins")
+    table = next(t for t in all_tables(load_records(results)) if t.title == "Paired comparisons")
     rows = {(row[0], row[1]): dict(zip(table.header, row, strict=True)) for row in table.rows}
     row = rows["4DGaussians + support against 4DGaussians", "never seen at t*"]
     assert float(row["PSNR a - b, dB"]) > 0 and row["n"] == "4 runs" and row["verdict"] == "win"
@@ -200,7 +202,7 @@ def test_who_wins_where_and_at_what_cost(results):
 
 
 def test_every_metric_says_which_way_is_better(results):
-    table = next(t for t in all_tables(load_records(results)) if t.title.startswith("Every metric"))
+    table = next(t for t in all_tables(load_records(results)) if t.title.startswith("All metrics"))
     row = next(r for r in table.rows if r[:2] == ["4DGaussians + support against 4DGaussians", "whole frame"])
     cells = dict(zip(table.header, row, strict=True))
     assert cells["PSNR, dB"].startswith("+") and cells["PSNR, dB"].endswith(" win")
@@ -228,7 +230,7 @@ def test_no_record_no_report(tmp_path):
         write_report(tmp_path, tmp_path / "report")
 
 
-def test_plots_strips_and_pictures_are_there(report):
+def test_report_contains_plots_strips_and_pictures(report):
     names = {p.name for p in report.glob("*.png")}
     assert {f"synthetic_{cost}.png" for cost in ("seconds", "frame_ms", "megabytes")} <= names
     for scene in ("room-3-exact", "ground-1-exact"):

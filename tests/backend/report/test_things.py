@@ -55,14 +55,14 @@ def test_a_pixel_is_recalled_if_near_the_truth_and_nearer_than_to_what_is_behind
     assert recalled(close, truth, truth.lerp(behind, 0.5), mask)[0] == 0
 
 
-def test_only_things_with_a_background_are_recalled(apple):
+def test_recall_needs_a_known_background(apple):
     truth, behind, mask = apple
     regions = {"swinging": mask, "hair": mask}
     assert recall_of({"swinging": behind}, truth, truth, regions) == {"swinging": [15, 15]}
     assert recall_of({}, truth, truth, regions) == {}
 
 
-def test_a_pane_is_opened_where_the_matte_says_so():
+def test_pane_is_counted_open_where_the_matte_marks_motion():
     pane = torch.zeros(8, 12, dtype=torch.bool)
     pane[:, :4] = True
     motion = torch.zeros(8, 12)
@@ -114,24 +114,24 @@ def record(host: str, supervision: str, counts: list[list[int]], error: float) -
 
 
 def test_the_report_tells_of_glass_and_small_movers(tmp_path):
-    made = record("auto", "support", [[10, 20], [4, 5], [30, 30]], 0.1)
-    again = load_record(save_record(tmp_path, made))
-    assert again == made and json.loads((tmp_path / f"{made.run_id}.json").read_text())["matte"] == made.matte
+    rows = record("auto", "support", [[10, 20], [4, 5], [30, 30]], 0.1)
+    again = load_record(save_record(tmp_path, rows))
+    assert again == rows and json.loads((tmp_path / f"{rows.run_id}.json").read_text())["matte"] == rows.matte
     tables = {table.title: table for table in all_tables([again])}
     ours, delivered = tables["Glass and mirrors"].rows
     assert ours == [
         "auto (ours)", "20.00", "–", "26.02", "-6.02", "–", "2.0%", "–", "3.0% (40.0%)", "–",
     ]  # fmt: skip
     assert delivered[6] == "–", "plate detail opens nothing"
-    assert tables["Small movers, and hair"].rows == [
+    assert tables["Small moving objects and hair"].rows == [
         ["auto (ours)", "0.80", "0.50", "–", "–", "–", "–"],
         ["auto (ours), plate detail", "0.90", "0.90", "–", "–", "–", "–"],
     ]
 
 
-def test_other_scenes_have_no_such_tables():
-    made = record("auto", "support", [[1, 1]], 0.1)
-    for row in made.rows:
+def test_scenes_without_hard_objects_have_no_object_tables():
+    rows = record("auto", "support", [[1, 1]], 0.1)
+    for row in rows.rows:
         row.recalled, row.opened, row.regions = {}, {}, {"whole": row.regions["whole"]}
-    made.matte, made.detailed = {}, {}
-    assert not {"Glass and mirrors", "Small movers, and hair"} & {table.title for table in all_tables([made])}
+    rows.matte, rows.detailed = {}, {}
+    assert not {"Glass and mirrors", "Small moving objects and hair"} & {table.title for table in all_tables([rows])}

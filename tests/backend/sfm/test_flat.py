@@ -24,8 +24,8 @@ def poster():
 
 
 def test_a_pan_over_a_still_is_flat_and_poor_however_small_its_error(poster):
-    told = flat_words(turned(poster))
-    assert told is not None and "one plane" in told[0]
+    words = flat_words(turned(poster))
+    assert words is not None and "one plane" in words[0]
     assert quality_words(40, 40, 0.01, misled=True).startswith("Poor") and quality_words(40, 40, 0.01).startswith(
         "Good"
     )

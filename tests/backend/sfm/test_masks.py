@@ -98,7 +98,7 @@ def test_nothing_moves_outside_of_the_mask(masked):
     assert moving > 0
 
 
-def test_the_same_mask_elsewhere_is_the_same_solve_and_another_one_is_not(masked, tmp_path, tools):
+def test_solve_key_depends_on_mask_content_not_path(masked, tmp_path, tools):
     shot, _, mask = masked
     copy = Shot(shutil.copytree(shot.root, tmp_path / "copy.splannequin"))
     shutil.copytree(mask, tmp_path / "moved")
@@ -120,7 +120,7 @@ def test_a_solve_without_masks_leaves_none_behind(masked, tmp_path):
     assert not copy.mask(PEOPLE, 101).is_file() and recorded_masks(copy) == {} and masks_key(copy) == []
 
 
-def test_a_mask_that_went_missing_is_named(masked, tmp_path):
+def test_missing_mask_is_named(masked, tmp_path):
     copy = Shot(shutil.copytree(masked[0].root, tmp_path / "copy.splannequin"))
     copy.mask(PEOPLE, 104).unlink()
     with pytest.raises(JobError, match=r"000104\.png is damaged or missing"):
@@ -144,7 +144,7 @@ def test_nothing_is_matched_a_little_around_a_mask(tmp_path):
 
 
 def test_frames_that_are_largely_masked_are_matched_with_more_than_their_neighbours(tmp_path):
-    def asked(share):
+    def features_for(share):
         covered = np.zeros((48, 64), bool)
         covered[:, : round(64 * share)] = True
         mask = Mask("people", (64, 48))
@@ -154,8 +154,8 @@ def test_frames_that_are_largely_masked_are_matched_with_more_than_their_neighbo
         frames = {"frames": [{"frame": n, "file": f"00000{n}.png"} for n in (1, 2)]}
         return _matching(frames, SolveConfig(), {"people": mask}, tmp_path / f"{share}")
 
-    assert "wide" not in asked(0.2) and asked(0.5)["wide"] is True
-    assert asked(0.5)["features"] == 2 * SolveConfig().features
+    assert "wide" not in features_for(0.2) and features_for(0.5)["wide"] is True
+    assert features_for(0.5)["features"] == 2 * SolveConfig().features
 
 
 def test_a_logo_is_painted_over_before_flow_looks_and_nothing_moves_at_its_rim():

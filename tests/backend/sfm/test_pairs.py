@@ -38,7 +38,7 @@ def matched(folder: Path, least: int, python: str = sys.executable) -> list:
 
 
 @pytest.fixture(scope="module")
-def alone(solved, tmp_path_factory):
+def one_process(solved, tmp_path_factory):
     """(folder with a request, database contents of one process)."""
     folder = tmp_path_factory.mktemp("alone")
     names = sorted(path.name for path in solved.shot.raw.glob("*.png"))[:8]
@@ -59,14 +59,14 @@ def unmatched(folder: Path, into: Path) -> Path:
     return into
 
 
-def test_several_processes_leave_the_same_database(alone, tmp_path):
-    folder, expected = alone
+def test_several_processes_leave_the_same_database(one_process, tmp_path):
+    folder, expected = one_process
     assert len(expected[0]) == 7 + 6 + 4, "1, 2 and 4 frames apart"
     assert matched(unmatched(folder, tmp_path / "three"), least=5) == expected
 
 
-def test_the_pairs_of_a_process_that_breaks_are_matched_all_the_same(alone, tmp_path):
-    folder, expected = alone
+def test_the_pairs_of_a_process_that_breaks_are_matched_all_the_same(one_process, tmp_path):
+    folder, expected = one_process
     broken = shutil.which("false")
     if broken is None:
         pytest.skip("no program that always fails")

@@ -84,7 +84,7 @@ def test_the_estimate_is_of_all_that_is_left():
     assert heard.bar[-1] == pytest.approx(0.5)
 
 
-def test_cameras_are_whole_when_they_are_known_and_a_search_that_ends_there_is_found_later(again):
+def test_cameras_are_complete_before_the_motion_search(again):
     shot, model = again
     shutil.rmtree(shot.motion)
     shutil.rmtree(shot.solve)
@@ -108,9 +108,9 @@ def test_a_job_tells_one_stage(again):
     folder = new_job(shot, "solve", SolveParams(cameras=model))
     assert run_job(folder)[0] == ExitCode.OK
     events = [json.loads(line) for line in (folder / EVENTS_FILE).read_text().splitlines()]
-    told = [event["data"] for event in events if event["type"] == "progress"]
-    shares = [data["done"] / data["total"] for data in told]
-    assert {data["stage"] for data in told} == {"solve"} and shares == sorted(shares)
+    progress = [event["data"] for event in events if event["type"] == "progress"]
+    shares = [data["done"] / data["total"] for data in progress]
+    assert {data["stage"] for data in progress} == {"solve"} and shares == sorted(shares)
     assert shares[-1] == pytest.approx(1.0)
     kinds = [event["data"].get("stage") for event in events]
     assert kinds.index("cameras known") < len(kinds) - 5

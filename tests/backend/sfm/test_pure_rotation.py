@@ -18,8 +18,8 @@ def pairs(moved):
     """(homographies, shifts of the picture's centre) of pairs whose second camera is transformed by `moved` [3, 3]."""
     homographies = np.array([LENS @ m @ np.linalg.inv(LENS) for m in moved])
     middle = np.array([320.0, 240.0, 1.0])
-    there = homographies @ middle
-    shifts = np.linalg.norm(there[:, :2] / there[:, 2:] - middle[:2], axis=1)
+    mapped = homographies @ middle
+    shifts = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - middle[:2], axis=1)
     return homographies, shifts
 
 

@@ -114,7 +114,7 @@ def test_st_maps_of_the_lens_before_go_and_that_is_said(again, tools):
     assert "The ST maps of the previous solve were for its lens and have been removed." in report.warnings
     report = tools.recorder()
     solve_shot(shot, SolveConfig(), report, cameras)
-    assert not any("ST maps" in told for told in report.warnings)
+    assert not any("ST maps" in warning for warning in report.warnings)
 
 
 @pytest.mark.parametrize("linked", ["frames", "solve/colmap", "solve/next", "solve/next/frames", "takes"])

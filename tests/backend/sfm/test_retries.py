@@ -13,7 +13,7 @@ from torch_backend.sfm.solving import SolveConfig, _key, solve_shot
 from torch_backend.sfm.verdict import Fault, fault_of
 from torch_backend.shot import Shot
 
-ASKED = {"solved": ["1.png"] * 60, "features": 4096, "camera_model": "SIMPLE_RADIAL"}
+REQUEST = {"solved": ["1.png"] * 60, "features": 4096, "camera_model": "SIMPLE_RADIAL"}
 LENS = {"doubt": "", "held": False, "found_deg": 60.0, "view_deg": 60.0, "found_bend": 0.0}
 
 
@@ -25,20 +25,20 @@ def attempt(kind, registered=20, lens=LENS, error=0.8, solved=60):
     return Attempt("first", Path(), answer, fault, solved)
 
 
-def rungs(best, **changes):
+def strategies(best, **changes):
     """(name, changes) of all strategies that are tried while `best` stays the best."""
     done = ["first"]
     found = []
-    while (rung := next_strategy(best, {**ASKED, **changes}, set(done))) is not None:
-        done.append(rung.name)
-        found.append((rung.name, *rung.changes.values()))
+    while (strategy := next_strategy(best, {**REQUEST, **changes}, set(done))) is not None:
+        done.append(strategy.name)
+        found.append((strategy.name, *strategy.changes.values()))
     return found
 
 
-def test_frames_that_are_matched_widely_already_are_not_matched_so_again():
+def test_wide_matching_is_not_retried_twice():
     done = {"first", "features"}
-    assert next_strategy(attempt("few"), {**ASKED, "wide": True}, done).name == "lens"
-    assert next_strategy(attempt("few"), ASKED, done).name == "pairs"
+    assert next_strategy(attempt("few"), {**REQUEST, "wide": True}, done).name == "lens"
+    assert next_strategy(attempt("few"), REQUEST, done).name == "pairs"
 
 
 MATCHING = [("features", 8192, 0.0025), ("pairs", True)]
@@ -67,20 +67,20 @@ OPENCV, FISHEYE = ("lens", "OPENCV"), ("lens", "OPENCV_FISHEYE")
     ],
 )
 def test_only_what_can_help_is_tried(best, expected):
-    assert rungs(best) == expected
+    assert strategies(best) == expected
 
 
-def test_a_lens_that_was_chosen_gives_way_to_a_fisheye_s_alone():
-    assert rungs(attempt("lens", 60), camera_model="OPENCV") == [("pairs", True)]
+def test_chosen_lens_model_is_retried_only_as_fisheye():
+    assert strategies(attempt("lens", 60), camera_model="OPENCV") == [("pairs", True)]
     bent = attempt("lens", 60, {**LENS, "doubt": "bent", "found_bend": -0.3})
-    assert rungs(bent, camera_model="OPENCV") == [FISHEYE, ("pairs", True)]
-    assert rungs(bent, camera_model="OPENCV_FISHEYE") == [("pairs", True)]
+    assert strategies(bent, camera_model="OPENCV") == [FISHEYE, ("pairs", True)]
+    assert strategies(bent, camera_model="OPENCV_FISHEYE") == [("pairs", True)]
 
 
-def test_a_focal_length_that_the_file_names_is_the_first_thing_to_doubt_unless_one_was_given():
-    assert [name for name, *_ in rungs(attempt("few"), start_focal_px=700.0)][:2] == ["focal", "features"]
-    assert rungs(attempt("few"), start_focal_px=700.0, focal_px=650.0) == rungs(attempt("few"))
-    assert rungs(attempt("narrow"), start_focal_px=700.0) == []
+def test_file_focal_length_is_doubted_first_unless_the_user_set_one():
+    assert [name for name, *_ in strategies(attempt("few"), start_focal_px=700.0)][:2] == ["focal", "features"]
+    assert strategies(attempt("few"), start_focal_px=700.0, focal_px=650.0) == strategies(attempt("few"))
+    assert strategies(attempt("narrow"), start_focal_px=700.0) == []
 
 
 def test_the_best_is_the_one_that_can_be_used_then_the_one_with_more_frames_then_the_one_that_fits():
@@ -97,19 +97,19 @@ def test_the_best_is_the_one_that_can_be_used_then_the_one_with_more_frames_then
 
 
 def test_of_two_tries_that_came_to_the_same_the_first_keeps_its_files(tmp_path, monkeypatch, tools):
-    def again(rung, request, frames, last, scratch, log, report):
-        folder = scratch / rung
+    def again(strategy, request, frames, last, scratch, log, report):
+        folder = scratch / strategy
         folder.mkdir()
         for name in ("poses.json", "database.db"):
-            (folder / name).write_text(rung)
-        return replace(attempt("poor"), strategy=rung, folder=folder)
+            (folder / name).write_text(strategy)
+        return replace(attempt("poor"), strategy=strategy, folder=folder)
 
     monkeypatch.setattr("torch_backend.sfm.retries._attempt", again)
-    solved = solve_with_retries(ASKED, {"frames": []}, True, tmp_path, tmp_path / "log", tools.recorder())
+    solved = solve_with_retries(REQUEST, {"frames": []}, True, tmp_path, tmp_path / "log", tools.recorder())
     assert solved.best.strategy == "first" and len(solved.tries) > 2
     assert (tmp_path / "first" / "poses.json").read_text() == "first"
     left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
-    assert left == {"first/poses.json", *(f"{told['rung']}/database.db" for told in solved.tries)}
+    assert left == {"first/poses.json", *(f"{attempt_record['rung']}/database.db" for attempt_record in solved.tries)}
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,10 @@ def test_a_clip_that_the_first_try_cannot_take_is_solved_with_more_features_and_
     result = solve_shot(fog, SolveConfig(features=1000), report)
     assert result["registered"] == 10
     record = read_json(fog.solve_record)
-    assert record["rung"] == "features" and [told["rung"] for told in record["tries"]] == ["first", "features"]
+    assert record["rung"] == "features" and [attempt_record["rung"] for attempt_record in record["tries"]] == [
+        "first",
+        "features",
+    ]
     assert record["tries"][1]["found"] == record["quality"]
     assert report.warnings[0].startswith("The frames show too little to match: ")
     assert report.warnings[0].endswith("Trying again with up to 2000 features per frame, including faint ones.")
@@ -166,7 +169,7 @@ def test_a_fisheye_that_was_taken_for_an_ordinary_lens_is_solved_as_one(tmp_path
     focal = 160.0
     rays = tools.fisheye_rays(focal, 0.02)
     pictures = [tools.room().cast(pose, rays) for pose in tools.handheld(9)]
-    request, frames = tools.asked(tmp_path, pictures)
+    request, frames = tools.request_for(tmp_path, pictures)
     report = tools.recorder()
     best = solve_with_retries(request, frames, True, tmp_path, tmp_path / "log.txt", report).best
     assert (best.strategy, best.fault) == ("lens", None)
@@ -184,7 +187,7 @@ def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(14)[:5]]
     rng = np.random.default_rng(3)
     pictures += [rng.integers(0, 256, (240, 320, 3), np.uint8) for _ in range(6)]
-    request, frames = tools.asked(tmp_path, pictures, features=250)
+    request, frames = tools.request_for(tmp_path, pictures, features=250)
     report = tools.recorder()
     with pytest.raises(JobError) as error:
         solve_with_retries(request, frames, True, tmp_path, tmp_path / "log.txt", report)
@@ -202,7 +205,7 @@ def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path
 
 def test_the_global_mapper_and_wider_pairs_find_the_room_as_well(tmp_path, tools):
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(10)]
-    request, frames = tools.asked(tmp_path, pictures, mapper="global", wide=True)
+    request, frames = tools.request_for(tmp_path, pictures, mapper="global", wide=True)
     answer = solve_with_retries(request, frames, False, tmp_path, tmp_path / "log.txt", tools.recorder()).best.answer
     assert fault_of(answer, frames) is None and answer["result"]["registered"] == 10
     assert answer["result"]["focal_px"] == pytest.approx(300.0, rel=0.02)

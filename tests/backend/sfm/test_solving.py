@@ -133,7 +133,7 @@ def test_progress_names_the_stages_in_order(solved):
     assert all(0 <= done <= total for _, done, total in solved.report.steps)
 
 
-def test_a_solved_shot_is_left_alone(solved, tools):
+def test_solved_shot_is_not_solved_again(solved, tools):
     before = {p: p.stat().st_mtime_ns for p in solved.shot.root.rglob("*") if p.is_file()}
     report = tools.recorder()
     assert solve_all(solved.shot, SolveConfig(features=1500), report) == solved.result
@@ -304,7 +304,7 @@ def test_a_lens_that_no_camera_has_is_refused(focal, message):
     assert (fault.kind, fault.error.message, fault.error.exit_code) == ("lens", message, ExitCode.SOLVE)
 
 
-def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
+def test_diverging_lens_is_fixed_to_a_common_one_and_reported(tmp_path, tools):
     """A frontal wall is ambiguous: far through a long lens looks like near through a short one."""
     poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(10)]
     shot, report = imported(tmp_path, tools, poses), tools.recorder()
@@ -329,8 +329,8 @@ def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
     ],
 )
 def test_a_doubtful_lens_is_said(lens, words):
-    told = {"focal_px": 7526.0, "lens": {**lens, "found_px": 24_000.0, "width": 1280, "height": 720}}
-    found = [message for message, _ in lens_remarks(told)]
+    answer = {"focal_px": 7526.0, "lens": {**lens, "found_px": 24_000.0, "width": 1280, "height": 720}}
+    found = [message for message, _ in lens_remarks(answer)]
     assert len(found) == len(words) and all(a.endswith(b) for a, b in zip(found, words, strict=True))
 
 
@@ -364,7 +364,7 @@ def test_cancelling_kills_the_worker_and_leaves_nothing_half_done(tmp_path, tool
     assert not list(shot.frames.glob("*.png"))
 
 
-def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, tools):
+def test_failed_worker_gives_a_readable_error(tmp_path, tools):
     (tmp_path / "request.json").write_text(json.dumps({"images": str(tmp_path)}))
     with pytest.raises(JobError, match="The camera solve failed") as error:
         run_worker(tmp_path / "request.json", tmp_path / "log.txt", tools.recorder())
@@ -396,7 +396,7 @@ def test_a_worker_ends_with_its_parent(tmp_path):
     assert worker.wait(timeout=50) == 1
 
 
-def test_solving_before_importing_says_so(tmp_path, tools):
+def test_solving_before_import_is_refused_readably(tmp_path, tools):
     with pytest.raises(JobError, match="has no frames yet"):
         solve_shot(Shot.create(tmp_path / "a.splannequin"), SolveConfig(), tools.recorder())
 
@@ -435,8 +435,8 @@ def test_the_worker_takes_no_module_from_where_the_request_lies(hostile, tmp_pat
     request |= {"overlap": 1, "features": 128, "neighbours": 1, "threads": 1}
     write_json(scratch / "request.json", request)
     try:
-        told = run_worker(scratch / "request.json", scratch / "log.txt", tools.recorder())
+        result = run_worker(scratch / "request.json", scratch / "log.txt", tools.recorder())
     except JobError as error:
-        told = error.message
-    assert "COLMAP" in str(told) or "failure" in told, "the worker itself answered"
+        result = error.message
+    assert "COLMAP" in str(result) or "failure" in result, "the worker itself answered"
     assert not marker.exists(), marker.read_text()

@@ -105,8 +105,8 @@ def anchor(m, field, bins):
     pairs = drawn(m, rows, config, 0)
     if pairs is None:
         return None
-    here = field(m.params["means"].detach()[pairs.rows], centres[pairs.bins])
-    return support_loss(m, field, pairs, here, centres, 1.0, config)
+    deltas = field(m.params["means"].detach()[pairs.rows], centres[pairs.bins])
+    return support_loss(m, field, pairs, deltas, centres, 1.0, config)
 
 
 def test_drawn_pairs_are_unsupported_and_half_of_them_near_support():
@@ -187,7 +187,7 @@ def test_stillness_is_paid_in_photometric_loss_and_does_not_change_it():
     assert price(shifts(0.1), error=0.5 * ERROR) == pytest.approx(0.5 * price(shifts(0.1)))
 
 
-def test_the_price_of_one_gaussian_does_not_depend_on_how_many_are_open():
+def test_loss_per_gaussian_is_independent_of_the_open_count():
     many, few = shifts(0.1, 0.0, 0.0, 0.0), shifts(0.1)
     assert price(many, 4) == pytest.approx(price(few, 4))
     for deltas in (many, few):
@@ -203,7 +203,7 @@ def test_a_field_may_look_for_motion_before_it_has_to_pay():
     assert prices[2] == prices[3]
 
 
-def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
+def test_visible_gaussians_that_do_not_contribute_are_not_anchored():
     """Its Gaussian moved away: frames show that it is gone, so nothing pulls it back."""
     m = model([[1, 1, 0, 0, 0, 0]] * 2)
     m.hidden[0] = False
@@ -238,8 +238,8 @@ def test_hidden_is_out_of_the_frame_or_behind_what_is_seen():
     assert not bool(m.hidden[:, 0].any())
 
 
-@pytest.mark.parametrize(("moves_away", "anchored"), [(True, False), (False, True)])
-def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
+@pytest.mark.parametrize(("is_gone", "anchored"), [(True, False), (False, True)])
+def test_render_distinguishes_vanished_from_occluded(is_gone, anchored):
     """A dot on a wall fades: in plain view, or behind a post in front of it. Only the covered dot is a guess."""
     from torch_backend.raster import rasterize
 
@@ -251,7 +251,7 @@ def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
     quats[:, 0] = 1
     logits = torch.full((223,), 5.0)
     logits[221] = -6.0  # the dot has faded
-    logits[222] = -9.0 if moves_away else 5.0
+    logits[222] = -9.0 if is_gone else 5.0
     state = {
         "means": means,
         "quats": quats,
@@ -271,7 +271,7 @@ def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
     assert bool(m.hidden[221, 1]) == anchored
 
 
-def test_detectors_against_gradients_made_by_hand():
+def test_detectors_match_hand_computed_gradients():
     K = torch.tensor([[10.0, 0, 16.0], [0, 20.0, 8.0], [0, 0, 1]])
     means = torch.tensor([[0.0, 0, 2]] * 4)
     # NDC gradient = pixel gradient * half the image size; pixel gradient = gradient of the mean * depth / focal length.
@@ -298,7 +298,7 @@ def test_detectors_against_gradients_made_by_hand():
         acted("gradient", straight)
 
 
-def test_the_signed_sum_agrees_with_the_rasterisers_own_norm():
+def test_signed_sum_matches_the_rasteriser_norm():
     """The mean's gradient across the line of sight is the screen gradient, up to the effect of the Gaussian's shape."""
     from torch_backend.raster import rasterize
 

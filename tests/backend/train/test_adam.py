@@ -22,9 +22,9 @@ SHAPES = [(3001, 3), (3001,), (3001, 1, 3), (3001, 8, 3), (7,), (1, 16, 9, 11)]
 
 def parameters(seed=0):
     g = torch.Generator().manual_seed(seed)
-    made = [torch.nn.Parameter(torch.randn(shape, generator=g)) for shape in SHAPES]
-    made[-1] = torch.nn.Parameter(made[-1].detach().contiguous(memory_format=torch.channels_last))
-    return made
+    created = [torch.nn.Parameter(torch.randn(shape, generator=g)) for shape in SHAPES]
+    created[-1] = torch.nn.Parameter(created[-1].detach().contiguous(memory_format=torch.channels_last))
+    return created
 
 
 def groups(params):
@@ -41,7 +41,7 @@ def give_gradients(params, generator, scale=1.0):
 def test_two_hundred_steps_match_torch(kernel):
     ours, theirs = parameters(), [torch.nn.Parameter(p.detach().double()) for p in parameters()]
     fused = FusedAdam(groups(ours), eps=1e-15, kernel=kernel)
-    other = torch.optim.Adam([{k: v for k, v in g.items() if k != "rows"} for g in groups(theirs)], eps=1e-15)
+    reference = torch.optim.Adam([{k: v for k, v in g.items() if k != "rows"} for g in groups(theirs)], eps=1e-15)
     singles = parameters()
     single = torch.optim.Adam([{k: v for k, v in g.items() if k != "rows"} for g in groups(singles)], eps=1e-15)
     generator = torch.Generator().manual_seed(1)
@@ -49,7 +49,7 @@ def test_two_hundred_steps_match_torch(kernel):
         give_gradients(ours, generator)
         for p, q, r in zip(ours, theirs, singles, strict=True):
             q.grad, r.grad = p.grad.double(), p.grad.clone()
-        for optimizer in (fused, other, single):
+        for optimizer in (fused, reference, single):
             for group in optimizer.param_groups:
                 group["lr"] *= 0.99
             optimizer.step()
@@ -68,7 +68,7 @@ def test_a_row_twice_as_far_moves_twice_as_fast(kernel):
             p.mul_(torch.logspace(-2, 2, len(p)).view(-1, *[1] * (p.dim() - 1)))
     theirs = [torch.nn.Parameter(p.detach().double()) for p in ours]
     fused = FusedAdam([{**g, "reach": reach} for g in groups(ours)], eps=1e-15, kernel=kernel)
-    other = torch.optim.Adam([{k: v for k, v in g.items() if k != "rows"} for g in groups(theirs)], eps=1e-15)
+    reference = torch.optim.Adam([{k: v for k, v in g.items() if k != "rows"} for g in groups(theirs)], eps=1e-15)
     generator = torch.Generator().manual_seed(1)
     for _ in range(50):
         give_gradients(ours, generator)
@@ -76,7 +76,7 @@ def test_a_row_twice_as_far_moves_twice_as_fast(kernel):
             q.grad = p.grad.double()
         before = [q.detach().clone() for q in theirs]
         fused.step()
-        other.step()
+        reference.step()
         for q, was in zip(theirs, before, strict=True):
             length = was.reshape(len(was), -1).norm(dim=1).clamp_min(1.0).view(-1, *[1] * (was.dim() - 1))
             q.data = was + (q.data - was) * length / reach
@@ -182,7 +182,7 @@ def test_any_number_of_threads_gives_the_same_bits():
             give_gradients(params, generator)
             optimizer.step(visible=torch.rand(3001, generator=generator) > 0.5)
         results.append(torch.cat([p.detach().flatten() for p in params]))
-    assert all(torch.equal(results[0], other) for other in results[1:])
+    assert all(torch.equal(results[0], repeated) for repeated in results[1:])
 
 
 @pytest.mark.parametrize("kernel", BODIES)
@@ -278,7 +278,7 @@ def test_what_growth_replaced_is_let_go_of(kernel):
     before = [weakref.ref(means), weakref.ref(optimizer.state[means]["exp_avg"])]
     del means
     model.rebuild(torch.tensor([0, 1, 1]), torch.zeros(3, dtype=torch.bool), optimizer)
-    assert [there() for there in before] == [None, None]
+    assert [reference() for reference in before] == [None, None]
 
 
 def test_wrong_calls_are_named():

@@ -56,7 +56,7 @@ def swaying(tmp_path_factory):
     return world
 
 
-def asked(run, depth=""):
+def params_of(run, depth=""):
     return TrainParams(run=run, iterations=60, max_gaussians=1500, holdout=8, depth=str(depth))
 
 
@@ -79,7 +79,7 @@ def pairs(swaying, quiet, tmp_path_factory):
     folder = write_depth(swaying, tmp_path_factory.mktemp("maps") / "depth")
     for seed in (0, 1):
         for name, depth in ((f"without-{seed}", ""), (f"with-{seed}", folder)):
-            train_shot(swaying.shot, dataclasses.replace(asked(name, depth), seed=seed, iterations=500), quiet())
+            train_shot(swaying.shot, dataclasses.replace(params_of(name, depth), seed=seed, iterations=500), quiet())
     return swaying
 
 
@@ -110,9 +110,9 @@ def test_the_depth_of_a_frozen_frame_is_measured_by_the_map_of_its_instant(pairs
         return float(np.median(np.abs(depth.numpy() / scene.scale / patch.depth_median[0].numpy() - 1.0)[inside]))
 
     depths, picture = FrameDepths(run, scene), pairs.image(pose, t_star / (FRAMES - 1))
-    given = scene.viewmats[pose], scene.Ks[pose], image.depth, image.motion, picture
-    without, _ = depths.of(*given)
-    with_map, sigma = depths.of(*given, measured)
+    inputs = scene.viewmats[pose], scene.Ks[pose], image.depth, image.motion, picture
+    without, _ = depths.of(*inputs)
+    with_map, sigma = depths.of(*inputs, measured)
     assert error(with_map) < 0.5 * error(without)
     assert bool((sigma >= 0).all()) and bool(torch.isfinite(sigma).all())
 
@@ -125,7 +125,7 @@ def test_fitted_maps_are_the_true_depth_whatever_scale_and_shift_they_had(swayin
     folder = write_depth(swaying, tmp_path / "depth", values, noise=0.005)
     name = kind.replace(" ", "-")
     report = quiet()
-    summary = train_shot(swaying.shot, asked(name, folder), report)
+    summary = train_shot(swaying.shot, params_of(name, folder), report)
     facts, scene = summary["depth"], load_scene(swaying.shot)
     # The tiny world has two depths, so a line through both fits for either kind of map.
     assert facts["residual"] < 0.02 and facts["frames"] == FRAMES
@@ -134,8 +134,8 @@ def test_fitted_maps_are_the_true_depth_whatever_scale_and_shift_they_had(swayin
     assert fitted is not None and fitted.frames == list(range(FIRST, FIRST + FRAMES))
     for n in (0, 7, 15):
         inverse, sigma = fitted.at(FIRST + n)
-        off = 1.0 / inverse.numpy() / scene.scale / true_depth(swaying, n) - 1.0
-        assert np.median(np.abs(off)) < 0.02
+        error = 1.0 / inverse.numpy() / scene.scale / true_depth(swaying, n) - 1.0
+        assert np.median(np.abs(error)) < 0.02
         assert 0.005 < float((sigma / inverse).median()) < 0.03
 
 
@@ -145,21 +145,23 @@ def test_frames_without_a_usable_map_are_trained_without_in_one_sentence(swaying
     (folder / "000104.png").write_bytes(b"no picture")
     cv2.imwrite(str(folder / "000105.png"), np.full((48, 20), 9, np.uint16))
     report = quiet()
-    summary = train_shot(swaying.shot, asked("holes", folder), report)
+    summary = train_shot(swaying.shot, params_of("holes", folder), report)
     assert summary["depth"]["frames"] == FRAMES - 3 and math.isfinite(summary["heldout_psnr_db"])
-    told = [event[1] for event in report.events if event[0] == "warning" and str(folder) in event[1]]
-    assert len(told) == 1 and "frame 103" in told[0] and "frame 104" in told[0] and "frame 105" in told[0]
+    warnings = [event[1] for event in report.events if event[0] == "warning" and str(folder) in event[1]]
+    assert (
+        len(warnings) == 1 and "frame 103" in warnings[0] and "frame 104" in warnings[0] and "frame 105" in warnings[0]
+    )
 
 
-def test_a_sequence_of_something_else_is_refused_and_so_is_one_without_a_usable_map(swaying, quiet, tmp_path):
+def test_unrelated_or_unusable_depth_sequence_is_refused(swaying, quiet, tmp_path):
     rng = np.random.default_rng(1)
-    other = write_depth(swaying, tmp_path / "other", lambda depth, n: rng.uniform(0.1, 1.0, depth.shape))
+    unrelated = write_depth(swaying, tmp_path / "other", lambda depth, n: rng.uniform(0.1, 1.0, depth.shape))
     broken = write_depth(swaying, tmp_path / "broken")
     for file in broken.iterdir():
         file.write_bytes(b"no picture")
-    for folder in (other, broken):
+    for folder in (unrelated, broken):
         with pytest.raises(JobError) as refused:
-            train_shot(swaying.shot, asked("refused", folder), quiet())
+            train_shot(swaying.shot, params_of("refused", folder), quiet())
         assert refused.value.exit_code == ExitCode.TRAIN and str(folder) in str(refused.value)
     assert not (swaying.shot.run("refused") / "checkpoint.safetensors").is_file()
 
@@ -169,7 +171,7 @@ def test_a_run_is_known_by_the_contents_of_its_maps(swaying, quiet, tmp_path):
 
     def key_after(depth):
         report = quiet()
-        train_shot(swaying.shot, asked("keyed", depth), report)
+        train_shot(swaying.shot, params_of("keyed", depth), report)
         done = ("progress", "training", 1, 1, "already trained") in report.events
         return read_meta(swaying.shot.run("keyed") / "checkpoint.safetensors")["key"], done
 
@@ -198,7 +200,7 @@ def test_a_run_is_known_by_the_contents_of_its_maps(swaying, quiet, tmp_path):
 
 def test_an_extended_run_keeps_its_maps_without_the_folder(swaying, quiet, tmp_path):
     folder = write_depth(swaying, tmp_path / "depth")
-    train_shot(swaying.shot, asked("longer", folder), quiet())
+    train_shot(swaying.shot, params_of("longer", folder), quiet())
     for file in folder.iterdir():
         file.unlink()
     summary = train_shot(swaying.shot, TrainParams(run="longer", extend=10), quiet())

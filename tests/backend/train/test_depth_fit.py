@@ -57,7 +57,7 @@ def test_the_deviation_that_it_states_is_that_of_the_maps():
     assert np.median([one.sigma for one in fit.frames.values()]) == pytest.approx(0.04 / 2.0, rel=0.1)
 
 
-def test_a_frame_without_points_has_the_line_that_all_others_share_and_is_less_sure():
+def test_frame_without_points_uses_the_shared_fit_with_less_certainty():
     samples = sequence(KINDS[0], [0.4] * FRAMES, [0.1] * FRAMES)
     values, depth = samples[5]
     fit = fit_sequence({**samples, 5: (values[:3], depth[:3])})
@@ -66,14 +66,14 @@ def test_a_frame_without_points_has_the_line_that_all_others_share_and_is_less_s
     assert fit.frames[5].sigma >= np.median([fit.frames[n].sigma for n in range(FRAMES) if n != 5])
 
 
-def test_a_metric_sequence_has_one_line_and_few_points_do_not_take_a_frame_away_from_it():
+def test_metric_sequence_has_one_fit_despite_few_points():
     samples = sequence(KINDS[0], [0.4] * FRAMES, [0.1] * FRAMES, noise=0.1)
     few = np.random.default_rng(2).permutation(400)[:25]
     values, depth = samples[7]
-    alone = fit_sequence({7: (values[few], depth[few])})
+    single = fit_sequence({7: (values[few], depth[few])})
     together = fit_sequence({**samples, 7: (values[few], depth[few])})
-    assert alone is not None and together is not None
-    assert abs(together.frames[7].slope - 0.4) < abs(alone.frames[7].slope - 0.4)
+    assert single is not None and together is not None
+    assert abs(together.frames[7].slope - 0.4) < abs(single.frames[7].slope - 0.4)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -84,5 +84,5 @@ def test_maps_of_something_else_do_not_fit(seed):
     assert fit is not None and not fit.fits
 
 
-def test_without_points_there_is_no_fit():
+def test_no_points_give_no_fit():
     assert fit_sequence({1: (np.ones(5), np.ones(5))}) is None

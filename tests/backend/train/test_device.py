@@ -41,7 +41,7 @@ class NamedDevices(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
-def test_the_checker_sees_a_tensor_made_anywhere(monkeypatch):
+def test_checker_finds_tensors_created_without_a_device(monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "STATIONS", [__file__])
     with NamedDevices() as mode:
         torch.zeros(3, device="cpu")
@@ -53,7 +53,7 @@ def test_the_checker_sees_a_tensor_made_anywhere(monkeypatch):
     ("method", "supervision"),
     [("auto", "support"), ("hexplane", "paper"), ("mlp", "paper"), ("control_points", "support")],
 )
-def test_stations_say_where_every_tensor_is_made(world, quiet, method, supervision):
+def test_every_tensor_is_created_on_a_named_device(world, quiet, method, supervision):
     name = f"named-{method}"
     params = TrainParams(run=name, iterations=60, max_gaussians=1500, method=method, supervision=supervision)
     with NamedDevices() as mode:
@@ -94,7 +94,7 @@ def test_a_card_that_is_not_used_is_said_at_the_start_of_training(world, quiet, 
 
 
 @needs_gpu
-def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
+def test_run_resumes_and_freezes_on_a_second_device(world, quiet):
     scene = load_scene(world.shot)
     images = load_images(scene, scene.solved, 64, 48)
     config = config_from_params(TrainParams(iterations=60, max_gaussians=1500))
@@ -106,13 +106,13 @@ def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
     path = world.shot.root / "gpu.safetensors"
     save_run(trainer, path)
     for device in ("cpu", "cuda"):
-        other = Trainer(scene, images.to(device), scene.solved, config, quiet(), {}, device)
-        restore_run(other, path)
-        assert torch.equal(other.generator.get_state(), trainer.generator.get_state())
+        resumed = Trainer(scene, images.to(device), scene.solved, config, quiet(), {}, device)
+        restore_run(resumed, path)
+        assert torch.equal(resumed.generator.get_state(), trainer.generator.get_state())
         for _ in range(10):
-            schedule_events(other)
-            loss = other.step()
-            other.iteration += 1
+            schedule_events(resumed)
+            loss = resumed.step()
+            resumed.iteration += 1
         assert loss.device.type == device and bool(torch.isfinite(loss))
 
 

@@ -41,19 +41,19 @@ def test_finds_a_drift():
         assert float(error.abs().mean()) < 0.01
 
 
-def test_a_place_that_is_told_exposes_as_the_time_does_to_the_bit():
+def test_exposure_by_place_equals_exposure_by_time():
     exposure, image = Exposure(torch.tensor([0.0, 0.3, 0.55, 1.0]), ExposureConfig()), torch.rand(4, 5, 3)
     with torch.no_grad():
         exposure.values.copy_(0.1 * torch.randn(exposure.values.shape))
     for time in (-0.1, 0.0, 0.21, 0.3, 0.4321, 0.9, 1.2):
         found = []
-        for told in (False, True):
+        for is_named in (False, True):
             exposure.values.grad = None
             left, right, share = exposure.place(time)
             places = torch.tensor([left, right]), torch.tensor([1.0 - share, share])
-            shown = exposure.apply_at(image, *places) if told else exposure.apply(image, time)
+            shown = exposure.apply_at(image, *places) if is_named else exposure.apply(image, time)
             shown.square().sum().backward()
             found.append((shown.detach(), exposure.values.grad))
         assert all(torch.equal(a, b) for a, b in zip(*found, strict=True)), time
-    off = Exposure(torch.tensor([0.0, 1.0]), ExposureConfig(on=False))
-    assert off.apply_at(image, torch.tensor([0, 1]), torch.tensor([0.5, 0.5])) is image
+    disabled = Exposure(torch.tensor([0.0, 1.0]), ExposureConfig(on=False))
+    assert disabled.apply_at(image, torch.tensor([0, 1]), torch.tensor([0.5, 0.5])) is image

@@ -39,8 +39,8 @@ def finished(world, quiet):
     return copy
 
 
-def same(one, other):
-    a, b = (load_checkpoint(path / "checkpoint.safetensors") for path in (one, other))
+def same(first, second):
+    a, b = (load_checkpoint(path / "checkpoint.safetensors") for path in (first, second))
     assert a[0].keys() == b[0].keys()
     for name, value in a[0].items():
         torch.testing.assert_close(b[0][name], value, rtol=1e-4, atol=1e-5, msg=name)
@@ -98,7 +98,7 @@ def test_the_finished_run_stays_until_the_last_added_step(world, quiet, finished
     assert {name: (folder / name).read_bytes() for name in kept} == kept
 
 
-def test_an_extension_of_other_length_begins_anew_and_says_so(world, quiet, finished):
+def test_extension_of_a_different_length_restarts_with_a_note(world, quiet, finished):
     folder = finished("ext-other")
     with pytest.raises(Cancelled):
         train_shot(world.shot, more("ext-other"), quiet(cancel_at=("training", 0.5)))
@@ -117,8 +117,8 @@ def test_a_run_is_extended_again_and_again(world, quiet, finished):
     assert (first["iterations"], second["iterations"]) == (80, 110)
     assert second["gaussians"] == before["gaussians"]
     assert second["moving_gaussians"] == before["moving_gaussians"]
-    told = [(e["from_iteration"], e["steps"], e["heldout_psnr_db_before"]) for e in second["extensions"]]
-    assert told == [(60, 20, before["heldout_psnr_db"]), (80, 30, first["heldout_psnr_db"])]
+    extensions = [(e["from_iteration"], e["steps"], e["heldout_psnr_db_before"]) for e in second["extensions"]]
+    assert extensions == [(60, 20, before["heldout_psnr_db"]), (80, 30, first["heldout_psnr_db"])]
     assert before["train_seconds"] < first["train_seconds"] < second["train_seconds"]
     rows = [row["detail"] for row in second["modelled"] if row["what"] == "extension"]
     assert rows == ["20 steps from step 60 on", "30 steps from step 80 on"]
@@ -127,7 +127,7 @@ def test_a_run_is_extended_again_and_again(world, quiet, finished):
     assert ("progress", "training", 1, 1, "already trained") in report.events
 
 
-def test_figures_that_a_kill_left_behind_are_made_up_for(world, quiet, finished):
+def test_figures_missing_after_a_kill_are_recomputed(world, quiet, finished):
     folder = finished("ext-figures")
     stale = (folder / "summary.json").read_bytes()
     train_shot(world.shot, more("ext-figures"), quiet())
@@ -231,7 +231,7 @@ def test_the_command_line_takes_it(world, quiet, finished, capsys):
     assert "no trained run 'ext-gone' to extend" in capsys.readouterr().out
 
 
-def test_the_steps_of_the_presets_are_what_blender_is_told():
+def test_preset_steps_match_those_in_blender():
     assert {name: preset().iterations for name, preset in PRESETS.items()} == PRESET_STEPS
     assert {name: preset().width for name, preset in PRESETS.items()} == contract.PRESET_WIDTHS
     assert tuple(sorted(hosts())) == contract.HOSTS

@@ -30,13 +30,13 @@ def test_the_work_of_a_run_that_grows_is_the_sum_of_its_steps():
 
 def test_the_first_step_does_not_count_and_what_is_between_neither():
     now = [0.0]
-    watch, told = Stopwatch(lambda: now[0]), []
+    watch, estimates = Stopwatch(lambda: now[0]), []
     now[0] = 100.0  # loading and compiling
     for n in range(STEPS + 3):
         now[0] += 50.0 if n == 0 else 0.2
-        told.append(watch.step(10.0))
-    assert [n for n, each in enumerate(told) if each is not None] == [STEPS - 1]
-    assert told[STEPS - 1] == pytest.approx(0.02)
+        estimates.append(watch.step(10.0))
+    assert [n for n, each in enumerate(estimates) if each is not None] == [STEPS - 1]
+    assert estimates[STEPS - 1] == pytest.approx(0.02)
     watch.begin()
     now[0] += 1000.0
     assert [watch.step(10.0) for _ in range(STEPS)][-1] == 0.0
@@ -63,7 +63,7 @@ def test_smaller_presets_take_less_and_what_fits_an_hour_is_named():
     assert warning_of(3600.0, 1280, False, rows) is None
 
 
-def test_a_clip_on_which_a_smaller_preset_trains_on_the_same_pictures_is_told_so():
+def test_smaller_preset_with_equal_pictures_is_reported():
     rows = smaller_presets("final", (640, 480), 20_000, 4e-7)
     assert [row.width for row in rows] == [640, 320]
     hint = warning_of(9000.0, 640, False, rows)[1]
@@ -73,9 +73,9 @@ def test_a_clip_on_which_a_smaller_preset_trains_on_the_same_pictures_is_told_so
 def test_a_long_run_says_how_long_it_takes_before_it_has_begun_in_earnest_and_when_it_goes_on(world, quiet):
     for resumed in (False, True):
         report = quiet(cancel_at=("training", (60 if resumed else 30) / 10**7))
-        asked = TrainParams(run="long", preset="standard", iterations=10**7, max_gaussians=1500, width=32)
+        params = TrainParams(run="long", preset="standard", iterations=10**7, max_gaussians=1500, width=32)
         with pytest.raises(Cancelled):
-            train_shot(world.shot, asked, report)
+            train_shot(world.shot, params, report)
         (left,) = (event[2]["seconds_left"] for event in report.events if event[:2] == ("metric", FORECAST))
         ((sentence, hint),) = (event[1:] for event in report.events if event[0] == "warning")
         more = " more" if resumed else ""
@@ -87,7 +87,7 @@ def test_a_short_run_is_silent_but_for_the_figure(world, quiet):
     report = quiet(cancel_at=("training", 60 / 240))
     with pytest.raises(Cancelled):
         train_shot(world.shot, TrainParams(run="short", iterations=240, max_gaussians=1500), report)
-    told = [event[2] for event in report.events if event[:2] == ("metric", FORECAST)]
-    assert len(told) == 2, "again after every measurement on frames held out"
-    assert all(row["of"] == "training" and 0 < row["seconds_left"] < 600 for row in told)
+    metrics = [event[2] for event in report.events if event[:2] == ("metric", FORECAST)]
+    assert len(metrics) == 2, "again after every measurement on frames held out"
+    assert all(row["of"] == "training" and 0 < row["seconds_left"] < 600 for row in metrics)
     assert not [event for event in report.events if event[0] == "warning" and "processor" in event[1]]

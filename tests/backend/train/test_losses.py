@@ -20,6 +20,6 @@ def test_ignored_pixels_teach_nothing_and_are_not_measured():
     loss.backward()
     assert image.grad is not None
     assert (image.grad[ignored] == 0).all() and (image.grad[~ignored] != 0).all()
-    other = torch.where(ignored[..., None], 1.0 - target, target)
-    assert photometric(image, other, 0.2, ignored) == loss != photometric(image, other, 0.2)
-    assert psnr(image, other, ignored) == psnr(image, target, ignored) != psnr(image, target)
+    altered = torch.where(ignored[..., None], 1.0 - target, target)
+    assert photometric(image, altered, 0.2, ignored) == loss != photometric(image, altered, 0.2)
+    assert psnr(image, altered, ignored) == psnr(image, target, ignored) != psnr(image, target)

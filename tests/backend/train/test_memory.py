@@ -35,7 +35,7 @@ def test_what_is_planned_fits(card_gb, method):
     assert found.gaussians <= 1_000_000
 
 
-def test_smaller_cards_get_less_and_say_so():
+def test_smaller_gpus_get_fewer_gaussians_with_a_note():
     plans = {card: plan(card) for card in (4, 6, 8, 12)}
     counts = [found.gaussians for found in plans.values()]
     assert counts == sorted(counts) and counts[0] < 1_000_000

@@ -101,9 +101,9 @@ def test_when_growth_of_a_long_run_ends_who_is_open_and_paints_no_mover_closes(p
     model, config = trainer.model, trainer.config
     movers = model.gaussians.open.clone()
     assert trainer.policy.facts.hardened is not None and movers.any()
-    beside = (centred_on_movers(trainer, 4) == 0) & (moving_frames(trainer, 0.05) == 0)
-    beside &= model.gaussians.support.any(1) & ~movers
-    strays = torch.nonzero(beside).flatten()[:20]
+    static_rows = (centred_on_movers(trainer, 4) == 0) & (moving_frames(trainer, 0.05) == 0)
+    static_rows &= model.gaussians.support.any(1) & ~movers
+    strays = torch.nonzero(static_rows).flatten()[:20]
     model.gaussians.open[strays] = True
     mean = mean_of(model, strays)
     trainer.config.densify.every = 1000  # no round of growth at this step
@@ -127,7 +127,7 @@ def test_where_the_mattes_say_that_nothing_moves_nothing_opens(tmp_path, quiet):
     assert load_run(world.shot, "still").model.field is None
 
 
-def test_published_hosts_do_not_heed_them(painted_world, quiet):
+def test_published_hosts_ignore_movers(painted_world, quiet):
     for changes in ({"method": "hexplane"}, {"host_config": "reference"}):
         assert trainer_of(painted_world, quiet, 0, **changes).movers is None
     assert trainer_of(painted_world, quiet, 0, method="static").movers is not None

@@ -31,23 +31,23 @@ def shot(tmp_path, world, quiet):
     for name in ("cameras.json", "points.npz"):
         shot.solve.mkdir(exist_ok=True)
         (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
-    told = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
-    (shot.solve / "solve.json").write_text(json.dumps(told))
+    record = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
+    (shot.solve / "solve.json").write_text(json.dumps(record))
     for n in range(101, 117):
         write_png(shot.frames / f"{n:06d}.png", read_png(shot.frames / "raw" / f"{n:06d}.png"))
     return shot
 
 
-def final(on_card, **asked):
-    return config_from_params(TrainParams(preset="final", **asked), on_card)
+def final(on_card, **changes):
+    return config_from_params(TrainParams(preset="final", **changes), on_card)
 
 
-def test_a_preset_has_a_cards_numbers_on_a_card_unless_others_are_asked_for():
+def test_final_preset_uses_gpu_numbers_unless_overridden():
     card, processor = final(True), final(False)
     assert (card.width, card.densify.budget, card.iterations, card.plates) == (1920, 1_000_000, 30_000, True)
     assert (processor.width, processor.densify.budget, processor.plates) == (0, 400_000, False)
-    asked = final(True, width=640, max_gaussians=5000, iterations=300)
-    assert (asked.width, asked.densify.budget, asked.iterations) == (640, 5000, 300)
+    chosen = final(True, width=640, max_gaussians=5000, iterations=300)
+    assert (chosen.width, chosen.densify.budget, chosen.iterations) == (640, 5000, 300)
     for name in ("preview", "standard"):
         same = [config_from_params(TrainParams(preset=name), on_card) for on_card in (False, True)]
         assert same[0] == same[1]
@@ -59,7 +59,7 @@ def test_the_processors_runs_are_known_by_what_they_were_known_by_and_a_cards_co
         assert config_from_json(config_to_json(final(on_card))) == final(on_card)
 
 
-def test_a_card_is_given_the_sources_own_frames_in_any_order(shot, quiet):
+def test_gpu_training_reads_source_frames_in_any_order(shot, quiet):
     scene, plates = load_scene(shot), Plates(shot)
     assert scene.width == 64 and plates.width == 128
     report = quiet()
@@ -72,7 +72,7 @@ def test_a_card_is_given_the_sources_own_frames_in_any_order(shot, quiet):
     assert pictures_of(shot, scene, final(True, width=100), report).size == (100, 75)
 
 
-def test_working_frames_serve_where_no_more_is_asked_for_or_there(shot, quiet):
+def test_working_frames_are_used_if_large_enough_or_without_source(shot, quiet):
     scene, report = load_scene(shot), quiet()
     for config, size in (
         (final(False), (64, 48)),
@@ -108,21 +108,21 @@ def test_a_frame_that_cannot_be_read_is_named_whichever_thread_finds_it(shot, qu
 
 
 def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(shot, quiet, monkeypatch):
-    asked = TrainParams(run="f", preset="final", iterations=120, max_gaussians=1500)
+    train_params = TrainParams(run="f", preset="final", iterations=120, max_gaussians=1500)
     scene, card = load_scene(shot), torch.device("cuda")
     with pytest.raises(Cancelled):
-        train_shot(shot, asked, quiet(cancel_at=("training", 0.1)))
+        train_shot(shot, train_params, quiet(cancel_at=("training", 0.1)))
     report = quiet()
-    config, key, _ = identity.requested_identity(shot, scene, shot.run("f"), asked, card, report, [])
+    config, key, _ = identity.requested_identity(shot, scene, shot.run("f"), train_params, card, report, [])
     assert not config.plates and key == json.loads((shot.run("f") / "config.json").read_text())["key"]
     assert [event[1] for event in report.events] == [
         "The run was started with the preset's settings for the processor, and continues with them."
     ]
-    again = TrainParams(**{**vars(asked), "resume": False})
+    again = TrainParams(**{**vars(train_params), "resume": False})
     assert identity.requested_identity(shot, scene, shot.run("f"), again, card, quiet(), [])[0].plates
-    assert identity.requested_identity(shot, scene, shot.run("another"), asked, card, quiet(), [])[0].plates
+    assert identity.requested_identity(shot, scene, shot.run("another"), train_params, card, quiet(), [])[0].plates
 
-    on_card = TrainParams(**{**vars(asked), "run": "c"})
+    on_card = TrainParams(**{**vars(train_params), "run": "c"})
     with monkeypatch.context() as patched, pytest.raises(Cancelled):
         patched.setattr(identity, "config_from_params", lambda params, on_card=False: config_from_params(params, True))
         train_shot(shot, on_card, quiet(cancel_at=("training", 0.1)))

@@ -44,7 +44,7 @@ def test_gradients_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(lambda x: corrected(viewmats, x), (values,))
 
 
-def test_the_gauge_holds_and_held_frames_follow_their_neighbours():
+def test_gauge_is_fixed_and_anchored_frames_follow_neighbours():
     poses = Poses([0.0, 0.2, 0.4, 0.8, 1.0], PosesConfig(), CPU)
     with torch.no_grad():
         poses.values[:] = torch.tensor([3.0, 100.0, 1.0, 2.0, 4.0])[:, None]
@@ -78,8 +78,8 @@ def shifts(trainer, viewmats):
     for cameras in (viewmats, trainer.scene.viewmats):
         pixel = (trainer.scene.points @ cameras[:, :3, :3].mT + cameras[:, None, :3, 3]) @ trainer.Ks.mT
         seen.append(pixel[..., :2] / pixel[..., 2:])
-    off = seen[0] - seen[1]
-    return off - off.mean(0)
+    difference = seen[0] - seen[1]
+    return difference - difference.mean(0)
 
 
 def test_wrong_cameras_are_found_and_frozen(world, quiet, tmp_path):
@@ -112,11 +112,11 @@ def test_what_a_gpu_computes_of_a_correction_is_the_same():
     twists[:, :3, 3] = 0.3 * torch.randn(6, 3, generator=g)
     assert torch.allclose(_series(twists), torch.matrix_exp(twists), atol=1e-6)
     times = np.array([0.0, 0.2, 0.4, 0.8, 1.0])
-    for held in ({1}, {0, 3}, {2, 4}, {0, 1}):
+    for anchored in ({1}, {0, 3}, {2, 4}, {0, 1}):
         poses = Poses(times.tolist(), PosesConfig(), CPU)
         with torch.no_grad():
             poses.values[:] = torch.randn(5, 6, generator=g)
-        gauge = _Gauge(times, held, CPU)
+        gauge = _Gauge(times, anchored, CPU)
         between = torch.lerp(poses.values[gauge.left], poses.values[gauge.right], gauge.share)
-        assert gauge.rows.tolist() == sorted(held)
-        assert torch.allclose(between, poses.at(times[sorted(held)], held), atol=1e-6)
+        assert gauge.rows.tolist() == sorted(anchored)
+        assert torch.allclose(between, poses.at(times[sorted(anchored)], anchored), atol=1e-6)

@@ -24,7 +24,7 @@ class Again:
     """Executes the work at each replay, on the current facts."""
 
     def __init__(self, fails=False, room=True, short=0):
-        self.fails, self.room, self.short, self.made, self.dropped = fails, room, short, 0, 0
+        self.fails, self.room, self.short, self.recorded, self.dropped = fails, room, short, 0, 0
 
     def watched(self):
         return contextlib.nullcontext()
@@ -41,7 +41,7 @@ class Again:
         self.short -= 1
         if self.short >= 0:
             raise torch.OutOfMemoryError("CUDA out of memory")
-        self.made += 1
+        self.recorded += 1
         result = torch.zeros(())
         return lambda: result.copy_(work()), result
 
@@ -98,14 +98,14 @@ def test_a_kind_is_launched_once_and_then_replayed_until_growth(trained):
     kinds = {kind for kind, _ in recorded.recorder._seen}
     assert {(kind.moves, kind.hidden) for kind in kinds} == {(False, False), (True, False), (True, True)}
     assert recorded.recorder.replayed == 24 - len(kinds) and recorded.recorder.refused == ""
-    assert recording.made > 3 and recording.dropped >= 2, "growth at 10 and 20"
+    assert recording.recorded > 3 and recording.dropped >= 2, "growth at 10 and 20"
 
 
 def test_while_nothing_moves_a_kind_is_recorded_once(trained):
     recording = Again()
     recorder = trained(recording, steps=10, method="static").recorder
     assert recorder.replayed == 10 - len(recorder._seen) > 0
-    assert recording.made <= len(recorder._seen) < 5 and recording.dropped == 0, "a kind has other harmonics"
+    assert recording.recorded <= len(recorder._seen) < 5 and recording.dropped == 0, "a kind has other harmonics"
 
 
 def test_a_run_goes_on_where_a_recording_fails_or_finds_no_room(trained):
@@ -132,11 +132,11 @@ def test_a_longer_list_of_hits_is_recorded_anew(trained, monkeypatch):
     plain, recording = trained(None), Again()
     recorded = trained(recording)
     assert equal(plain, recorded) and len(rooms) < 999
-    assert {made.listed for made in recorded.recorder._recorded.values()} == {200}
+    assert {entry.listed for entry in recorded.recorder._recorded.values()} == {200}
     usual = Again()
     monkeypatch.setattr("torch_backend.train.recorder.listed", lambda *_: 100)
     trained(usual)
-    assert recording.made > usual.made
+    assert recording.recorded > usual.recorded
 
 
 def test_recordings_go_when_steps_come_that_cannot_be_recorded(trained):
@@ -178,11 +178,11 @@ def test_work_between_steps_has_the_room_of_recordings(trained):
 
 def test_where_memory_ends_the_recordings_go_first_and_the_run_stays_as_it_is(trained, tmp_path):
     recorded = trained(Again(), steps=19)
-    before, told = len(recorded.model.gaussians), len(recorded.report.events)
+    before, event_count = len(recorded.model.gaussians), len(recorded.report.events)
     loop = TrainingLoop(recorded, tmp_path / "c.safetensors", lambda _: None)
     loop._make_room()
     assert recorded.recorder.refused != "" and recorded.pieces is None
-    assert len(recorded.model.gaussians) == before and len(recorded.report.events) == told
+    assert len(recorded.model.gaussians) == before and len(recorded.report.events) == event_count
     with pytest.raises(JobError, match="too little memory"):  # so few Gaussians cannot be reduced further
         loop._make_room()
 

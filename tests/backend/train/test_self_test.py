@@ -26,8 +26,8 @@ def cards(nvidia_smi):
 
 
 @pytest.fixture
-def other_adam(monkeypatch):
-    """other_adam(old, new): replaces a part of the source of Adam's kernel."""
+def changed_adam(monkeypatch):
+    """changed_adam(old, new): replaces a part of the source of Adam's kernel."""
 
     def change(old: str, new: str) -> None:
         source = adam._source
@@ -42,9 +42,9 @@ def other_adam(monkeypatch):
     adam._kernel.cache_clear()
 
 
-def test_kernels_that_compute_something_else_are_found(other_adam, monkeypatch):
+def test_kernels_that_compute_something_else_are_found(changed_adam, monkeypatch):
     monkeypatch.setattr(self_test, "_frame", lambda device: [])  # tested on a simulated GPU
-    other_adam("r[1] * (g[i] - m[i])", "1.02f * r[1] * (g[i] - m[i])")
+    changed_adam("r[1] * (g[i] - m[i])", "1.02f * r[1] * (g[i] - m[i])")
     found = run_self_test(torch.device("cpu"))
     assert len(found.checks) == 5 and found.lasting
     assert [c.what for c in found.checks if not c.error <= c.bound] == ["a step of Adam"]
@@ -61,18 +61,16 @@ def test_kernels_that_compute_something_else_are_found(other_adam, monkeypatch):
         ("plane_penalty", "const float gap", "constfloat gap", "a kernel does not build or run on it ("),
     ],
 )
-def test_where_only_the_fields_kernels_are_wrong_torch_stands_in_for_them(
-    kernel, old, new, wrong, monkeypatch, quiet, capfd
-):
+def test_torch_replaces_wrong_field_kernels(kernel, old, new, wrong, monkeypatch, quiet, capfd):
     source = planes_cuda.source
     assert old in source(kernel, 16)
 
-    def other(name: str, channels: int) -> str:
+    def changed_source(name: str, channels: int) -> str:
         return source(name, channels).replace(old, new) if name == kernel else source(name, channels)
 
     for name in ("_frame", "_loss", "_adam"):
         monkeypatch.setattr(self_test, name, lambda where: [])
-    monkeypatch.setattr(planes_cuda, "source", other)
+    monkeypatch.setattr(planes_cuda, "source", changed_source)
     monkeypatch.setattr(planes_cuda, "refused", "")
     planes_cuda.kernels.cache_clear()
     try:
@@ -96,31 +94,31 @@ def test_where_only_the_fields_kernels_are_wrong_torch_stands_in_for_them(
     capfd.readouterr()
 
 
-def test_a_kernel_that_does_not_build_is_a_sentence(other_adam, monkeypatch, capfd):
+def test_a_kernel_that_does_not_build_is_a_sentence(changed_adam, monkeypatch, capfd):
     monkeypatch.setattr(self_test, "_frame", lambda device: [])
-    other_adam("float odd", "flaot odd")
+    changed_adam("float odd", "flaot odd")
     found = run_self_test(torch.device("cpu"))
     assert found.problem.startswith("a kernel does not build or run on it (") and "\n" not in found.problem
     capfd.readouterr()
 
 
 def test_a_card_is_tested_once_and_again_after_an_update(tmp_path: Path, cards):
-    asked = []
+    calls = []
 
     def test(key: str) -> SelfTest:
-        asked.append(key)
+        calls.append(key)
         return SelfTest(key=key, problem="it is broken", checks=[self_test.Check("a frame", 0.5, 0.01)])
 
     cards("NVIDIA GeForce RTX 4070, 580.65.06, 8.9")
     assert [card_verdict(tmp_path, test).problem for _ in range(3)] == ["it is broken"] * 3
-    assert len(asked) == 2, "what fails is tested again, and not a third time"
+    assert len(calls) == 2, "what fails is tested again, and not a third time"
     kept = json.loads((tmp_path / "splannequin-card.json").read_text())
     assert kept["checks"] == [{"what": "a frame", "error": 0.5, "bound": 0.01}]
     cards("NVIDIA GeForce RTX 4070, 590.10.01, 8.9")
     card_verdict(tmp_path, test)
-    assert len(asked) == 4 and asked[1] != asked[2]
+    assert len(calls) == 4 and calls[1] != calls[2]
     (tmp_path / "splannequin-card.json").write_text("[]")  # a damaged file counts as missing
-    assert card_verdict(tmp_path, test).problem == "it is broken" and len(asked) == 6
+    assert card_verdict(tmp_path, test).problem == "it is broken" and len(calls) == 6
 
 
 def test_what_may_be_otherwise_the_next_time_is_not_kept(tmp_path: Path):
@@ -151,8 +149,8 @@ def test_a_test_that_was_killed_is_tried_again_by_the_next_job(tmp_path: Path, m
     found = card_verdict(tmp_path)
     assert found.problem.startswith("the process that tested it ended with code")
     assert (tmp_path / "splannequin-card.json").is_file() == kept
-    asked = len((tmp_path / "asked").read_text())
-    assert asked == (2 if kept else 1)
+    calls = len((tmp_path / "asked").read_text())
+    assert calls == (2 if kept else 1)
     assert card_verdict(tmp_path, lambda key: SelfTest(key=key)).problem == (found.problem if kept else "")
 
 
@@ -166,20 +164,20 @@ def test_a_disk_that_is_full_while_kernels_compile_speaks_against_no_card(monkey
 
 
 def test_a_card_that_does_not_answer_is_waited_for_once(monkeypatch, quiet):
-    asked = []
+    calls = []
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
 
     def silent() -> SelfTest:
-        asked.append(1)
+        calls.append(1)
         return SelfTest(problem="it did not answer within 240 s")
 
     monkeypatch.setattr(device, "card_verdict", silent)
     report = quiet()
-    assert choose_device("auto", report, "Freezing").type == "cpu" and len(asked) == 1
+    assert choose_device("auto", report, "Freezing").type == "cpu" and len(calls) == 1
     ((_, sentence, advice),) = report.events
     assert sentence.startswith("Freezing uses the processor, not the graphics card: ") and "240 s" in sentence
     assert "doctor --gpu" in advice
-    assert choose_device("cpu", report, "Freezing").type == "cpu" and len(report.events) == len(asked) == 1
+    assert choose_device("cpu", report, "Freezing").type == "cpu" and len(report.events) == len(calls) == 1
 
 
 def test_a_card_that_fails_is_not_used_and_said(monkeypatch):

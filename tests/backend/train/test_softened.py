@@ -28,20 +28,22 @@ def soft(picture, block):
     return torch.stack([torch.stack(row) for row in means])
 
 
-def loss_of(made, image, target, dssim, ignored, frame, progress):
-    return made.loss(image, target, dssim, ignored, made.movers_at(frame, progress))
+def loss_of(movers_loss, image, target, dssim, ignored, frame, progress):
+    return movers_loss.loss(image, target, dssim, ignored, movers_loss.movers_at(frame, progress))
 
 
-def test_it_is_the_loss_of_what_stands_still_and_the_loss_of_soft_movers(pictures):
+def test_loss_is_the_static_loss_plus_softened_movers(pictures):
     image, target, movers = pictures
-    made = SoftenedMovers(movers, W, span=(0.2, 0.5), block=16.0)
-    assert made.block == 4 and made.margin == 1
+    movers_loss = SoftenedMovers(movers, W, span=(0.2, 0.5), block=16.0)
+    assert movers_loss.block == 4 and movers_loss.margin == 1
     around = torch.zeros(H, W, dtype=torch.bool)
     around[39:61, 99:131] = True
     blocks = torch.zeros(23, 41, dtype=torch.bool)
     blocks[9:16, 24:33] = True
     expected = photometric(image, target, 0.2, around) + photometric(soft(image, 4), soft(target, 4), 0.2, ~blocks)
-    assert loss_of(made, image, target, 0.2, None, 0, 0.49).item() == pytest.approx(float(expected.detach()), abs=1e-12)
+    assert loss_of(movers_loss, image, target, 0.2, None, 0, 0.49).item() == pytest.approx(
+        float(expected.detach()), abs=1e-12
+    )
 
 
 def test_only_the_mean_of_what_moves_counts(pictures):
@@ -53,16 +55,16 @@ def test_only_the_mean_of_what_moves_counts(pictures):
         swapped[48:52, 108:112] = image[48:52, 108:112].flip(0, 1)
         still = image.clone()
         still[8:12, 8:12] = image[8:12, 8:12].flip(0, 1)
-    made = SoftenedMovers(movers, W, span=(0.2, 0.5), block=16.0)
-    assert float(loss_of(made, swapped, target, 0.2, None, 0, 0.2)) < 1e-9
-    assert float(loss_of(made, still, target, 0.2, None, 0, 0.2)) > 1e-4
+    movers_loss = SoftenedMovers(movers, W, span=(0.2, 0.5), block=16.0)
+    assert float(loss_of(movers_loss, swapped, target, 0.2, None, 0, 0.2)) < 1e-9
+    assert float(loss_of(movers_loss, still, target, 0.2, None, 0, 0.2)) > 1e-4
     for progress in (0.19, 0.5):
-        assert float(loss_of(made, swapped, target, 0.2, None, 0, progress)) > 1e-4, (
+        assert float(loss_of(movers_loss, swapped, target, 0.2, None, 0, progress)) > 1e-4, (
             "before and later its details count"
         )
 
 
-def test_a_hand_that_is_far_from_where_it_should_be_is_pulled_there(pictures):
+def test_softened_loss_attracts_a_distant_hand(pictures):
     """A bar of 2 px is 2.5 px from its place; at full resolution, small shifts do not change its error."""
     _, _, movers = pictures
     movers[0, :, 60:140] = True
@@ -71,9 +73,9 @@ def test_a_hand_that_is_far_from_where_it_should_be_is_pulled_there(pictures):
     def bar(at):
         return torch.sigmoid(6.0 * (1.0 - (across - at).abs()))[None, :, None].expand(H, W, 3)
 
-    def pull(made):
+    def pull(movers_loss):
         at = torch.tensor(99.5, dtype=torch.float64, requires_grad=True)
-        loss_of(made, bar(at), bar(102.0), 0.0, None, 0, 0.2).backward()
+        loss_of(movers_loss, bar(at), bar(102.0), 0.0, None, 0, 0.2).backward()
         return float(at.grad)
 
     whole, softened = (pull(SoftenedMovers(m, W, span=(0.2, 0.5), block=16.0)) for m in (None, movers))

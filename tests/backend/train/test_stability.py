@@ -67,8 +67,8 @@ def finite(trainer: Trainer) -> bool:
 def aligned(trainer: Trainer) -> bool:
     g, d = trainer.model.gaussians, trainer.densifier
     sizes = {len(t) for t in (*g.params.values(), g.open, g.support, g.hidden, d.gradient, d.seen)}
-    held = {id(p) for group in trainer.optimizer.param_groups for p in group["params"]}
-    return len(sizes) == 1 and all(id(p) in held for p in g.params.values())
+    optimised = {id(p) for group in trainer.optimizer.param_groups for p in group["params"]}
+    return len(sizes) == 1 and all(id(p) in optimised for p in g.params.values())
 
 
 def gaussian(name, value, row=7):
@@ -159,7 +159,7 @@ def test_what_was_in_order_stays_as_it_was_row_by_row(begin):
     assert repair(model, trainer.optimizer, densifier, trainer.soundness.memory, 30) == ""
 
 
-def test_a_gradient_of_its_own_costs_a_gaussian_and_no_more(begin):
+def test_non_finite_gradient_removes_only_its_gaussian(begin):
     trainer = begin("static")
     count = len(trainer.model.gaussians)
     trainer.model.gaussians.params["means"].register_hook(lambda g: g.index_fill(0, torch.tensor([4]), NAN))
@@ -235,7 +235,7 @@ def test_a_field_that_throws_gaussians_out_of_their_place_is_put_back(begin, hos
 
 
 @pytest.mark.parametrize(("share", "times", "said"), [(0.2, 7.0, 1), (0.2, 5.0, 0), (0.05, 7.0, 0)])
-def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(begin, share, times, said):
+def test_diverged_field_is_restored_between_two_checks(begin, share, times, said):
     """The bound is relative to the extent of moving Gaussians; the extent of the whole scene is many times larger."""
     trainer = begin("hexplane", 30)
     means = trainer.model.gaussians.params["means"].detach()[trainer.model.open_rows()]
@@ -267,13 +267,13 @@ def bound_between(trainer: Trainer, count: int) -> torch.Tensor:
     return far >= first
 
 
-def test_who_is_thrown_out_of_its_place_is_dropped_and_nobody_else(begin):
+def test_only_displaced_outliers_are_dropped(begin):
     trainer = begin("hexplane", 30)
     model, memory = trainer.model, trainer.soundness.memory
     assert drop_displaced(model, trainer.optimizer, trainer.densifier, memory) == 0
-    thrown = bound_between(trainer, 7)
-    expected = {name: p.detach()[~thrown].clone() for name, p in model.gaussians.params.items()}
-    gradient = trainer.densifier.gradient[~thrown].clone()
+    outliers = bound_between(trainer, 7)
+    expected = {name: p.detach()[~outliers].clone() for name, p in model.gaussians.params.items()}
+    gradient = trainer.densifier.gradient[~outliers].clone()
     assert drop_displaced(model, trainer.optimizer, trainer.densifier, memory) == 7
     for name, p in model.gaussians.params.items():
         assert torch.equal(p, expected[name]), name
@@ -284,7 +284,7 @@ def test_who_is_thrown_out_of_its_place_is_dropped_and_nobody_else(begin):
 
 
 @pytest.mark.parametrize("method", ["auto", "hexplane"])
-def test_a_round_of_growth_drops_what_is_thrown_behind_a_gate_alone(begin, method):
+def test_growth_drops_outliers_only_with_a_gate(begin, method):
     """Published hosts without a gate stay as published."""
     trainer = begin(method, 30)
     if method == "auto":
@@ -293,15 +293,15 @@ def test_a_round_of_growth_drops_what_is_thrown_behind_a_gate_alone(begin, metho
     # no other Gaussians are added or dropped
     trainer.densifier.config.budget = trainer.densifier.config.prune_opacity = 0
     count = len(trainer.model.gaussians)
-    thrown = bound_between(trainer, 3)
-    kept = trainer.model.gaussians.params["means"].detach()[~thrown].clone()
+    outliers = bound_between(trainer, 3)
+    kept = trainer.model.gaussians.params["means"].detach()[~outliers].clone()
     schedule_events(trainer)
     assert len(trainer.model.gaussians) == count - 3 * (method == "auto")
     if method == "auto":
         assert torch.equal(trainer.model.gaussians.params["means"], kept)
 
 
-def test_a_small_thing_may_move_by_many_times_its_size(begin):
+def test_small_gaussian_may_move_by_many_times_its_size(begin):
     trainer = begin("hexplane", 30)
     means = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)) * 0.02
     trainer.soundness.memory.keep(trainer.model.field, means)
@@ -323,21 +323,21 @@ def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin
     assert [0.5 * lr, 0.5 * lr * trainer.config.field.lr_end] in rates
 
 
-def test_a_resumed_run_drops_who_is_thrown_as_an_unbroken_one_does(begin, tmp_path):
+def test_resumed_run_drops_the_same_outliers(begin, tmp_path):
     """Without a stored bound it would drop nothing until its next inspection, and a round of growth may come first."""
     trainer = begin("hexplane", 30)
     trainer.soundness.memory.observe(torch.full((len(trainer.model.open_rows()), 3), 1e6))
     worst = float(trainer.soundness.memory._worst)
-    thrown = bound_between(trainer, 5)
+    outliers = bound_between(trainer, 5)
     save_run(trainer, tmp_path / "checkpoint.safetensors")
     resumed = begin("hexplane", 0)
     restore_run(resumed, tmp_path / "checkpoint.safetensors")
     memory = resumed.soundness.memory
-    assert drop_displaced(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(thrown.sum())
+    assert drop_displaced(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(outliers.sum())
     assert worst > 0 and "restored the field" in memory.restore_stable(resumed.model.field, resumed.optimizer)
     assert trainer.soundness.memory.restore_stable(trainer.model.field, trainer.optimizer)
-    for (name, p), (_, other) in zip(trainer.model.field.named_parameters(), resumed.model.field.named_parameters()):
-        assert torch.equal(p, other), name
+    for (name, p), (_, q) in zip(trainer.model.field.named_parameters(), resumed.model.field.named_parameters()):
+        assert torch.equal(p, q), name
 
 
 def test_a_field_that_joins_sooner_starts_at_the_rates_of_a_third_of_the_run():
@@ -361,7 +361,7 @@ def test_a_field_that_joins_sooner_starts_at_the_rates_of_a_third_of_the_run():
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh0", "shN"])
-def test_a_hasty_step_of_one_attribute_is_trained_away(begin, name):
+def test_large_step_of_one_attribute_recovers(begin, name):
     trainer = begin("static", 20)
     loss = float(torch.tensor(go_on(trainer, 10)).mean())
     normal = trainer._schedule_rates
@@ -411,26 +411,26 @@ def test_a_step_that_memory_did_not_suffice_for_opens_the_gate_once(begin):
     assert [group.get("name") for group in trainer.optimizer.param_groups] == groups
 
 
-def test_a_field_that_memory_did_not_suffice_for_is_made_anew(begin, monkeypatch):
-    module, made = sys.modules[schedule_events.__module__], []
+def test_field_is_rebuilt_after_out_of_memory(begin, monkeypatch):
+    module, restarts = sys.modules[schedule_events.__module__], []
 
     def short(*arguments):
-        made.append(arguments)
-        if len(made) == 1:
+        restarts.append(arguments)
+        if len(restarts) == 1:
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return add_field(*arguments)
 
     add_field = module.add_field
     monkeypatch.setattr(module, "add_field", short)
     trainer = begin("control_points", steps=0)
-    while not made:
+    while not restarts:
         try:
             go_on(trainer, 1)
         except torch.OutOfMemoryError:
             assert trainer.model.field is None
     go_on(trainer, 2)
     names = [group.get("name") for group in trainer.optimizer.param_groups]
-    assert trainer.model.field is not None and len(names) == len(set(names)) and len(made) == 2
+    assert trainer.model.field is not None and len(names) == len(set(names)) and len(restarts) == 2
 
 
 def test_too_much_to_repair_ends_in_words(begin):

@@ -33,17 +33,17 @@ def learnt(world, quiet):
 
 def test_it_shows_the_wall_at_every_frame_and_not_the_patch_where_it_is_for_a_moment(world, learnt):
     shown, _ = learnt
-    away, went = [], []
+    clear, passed = [], []
     for n in range(FRAMES):
         picture = shown(FIRST + n)
         assert picture.shape == (HEIGHT, WIDTH, 3) and picture.dtype == np.uint8
         error = np.abs(picture.astype(int) - read_png(world.shot.plate(FIRST + n))).max(-1)
-        now, other = (patch_of(world, n, time) for time in (n / (FRAMES - 1), 1.0 - n / (FRAMES - 1)))
-        away.append(error[(now < 0.01) & (other < 0.01)])
-        went.append(error[(now > 0.9) & (other < 0.1)])
-    away, went = np.concatenate(away), np.concatenate(went)
-    assert np.median(away) < 4 and np.quantile(away, 0.95) < 20
-    assert len(went) > 200 and np.median(went) > 32
+        now, mirrored = (patch_of(world, n, time) for time in (n / (FRAMES - 1), 1.0 - n / (FRAMES - 1)))
+        clear.append(error[(now < 0.01) & (mirrored < 0.01)])
+        passed.append(error[(now > 0.9) & (mirrored < 0.1)])
+    clear, passed = np.concatenate(clear), np.concatenate(passed)
+    assert np.median(clear) < 4 and np.quantile(clear, 0.95) < 20
+    assert len(passed) > 200 and np.median(passed) > 32
 
 
 def test_its_training_is_a_stage_of_the_solve_and_says_nothing_else(learnt):

@@ -82,7 +82,7 @@ def test_probes_are_spread_and_never_an_end():
         assert int(gaps.max() - gaps.min()) <= 1
 
 
-def test_growth_is_judged_per_tenth_and_only_when_there_was_some():
+def test_growth_is_judged_per_tenth_if_any_happened():
     measured = [(100 * n, round(1000 * 1.1**n), 20.0 + 0.2 * n) for n in range(6)]
     assert growth_gain(measured) == pytest.approx(0.2, rel=0.01)
     flat = [*measured, *((100 * n, round(1000 * 1.1**n), 21.0 - 0.01 * (n % 2)) for n in range(6, 11))]
@@ -260,7 +260,7 @@ def test_what_a_degree_was_dropped_from_is_what_joins():
     assert (facts.exposure_gain_db, facts.field_gain_db) == (pytest.approx(0.3), pytest.approx(0.2))
 
 
-def test_refined_cameras_are_judged_once_and_only_while_probes_are_held():
+def test_refined_cameras_are_judged_once_with_held_out_probes():
     policy = policy_of()
     policy.judge_cameras(Numbers(30), torch.eye(4)[None])
     assert policy.facts.poses_gain_db == pytest.approx(0.1)
@@ -270,7 +270,7 @@ def test_refined_cameras_are_judged_once_and_only_while_probes_are_held():
     assert policy.facts.poses_gain_db is None
 
 
-def test_facts_come_back_from_runs_of_other_versions():
+def test_stopping_facts_load_from_older_versions():
     facts = RunFacts(growth_gain_db=0.1, opened=FieldOpened(100, 2.5), hardened=225)
     assert facts.to_json() == {"growth_gain_db": 0.1, "opened": {"iteration": 100, "seconds": 2.5}, "hardened": 225}
     assert RunFacts.from_json(facts.to_json()) == facts
@@ -327,7 +327,7 @@ def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
             torch.testing.assert_close(resumed.model.gaussians.params[name], value, rtol=1e-4, atol=1e-5, msg=name)
 
 
-def test_published_hosts_are_left_alone(long_world, quiet):
+def test_published_hosts_are_not_stopped_early(long_world, quiet):
     scene, images = long_world
     for params in (TrainParams(method="hexplane"), TrainParams(host_config="reference")):
         trainer = Trainer(scene, images, scene.solved, config_from_params(params), quiet())

@@ -47,14 +47,14 @@ def short(world, name, **changes):
     return TrainParams(run=name, iterations=60, max_gaussians=1500, **changes)
 
 
-def test_frames_too_many_for_the_memory_train_the_same_run_from_a_file_that_nobody_sees(world, quiet, monkeypatch):
+def test_frames_beyond_memory_train_identically_from_a_hidden_file(world, quiet, monkeypatch):
     train_shot(world.shot, short(world, "held"), quiet())
     monkeypatch.setattr(torch_backend.scene, "IMAGE_MEMORY_BYTES", 0)
     scene, folder = load_scene(world.shot), world.shot.run("mapped")
     train_shot(world.shot, short(world, "mapped"), quiet())
-    held, _ = load_checkpoint(world.shot.run("held") / "checkpoint.safetensors")
+    from_file, _ = load_checkpoint(world.shot.run("held") / "checkpoint.safetensors")
     mapped, _ = load_checkpoint(folder / "checkpoint.safetensors")
-    assert all(torch.equal(value, mapped[name]) for name, value in held.items())
+    assert all(torch.equal(value, mapped[name]) for name, value in from_file.items())
     images = load_images(scene, scene.solved, 64, 48, folder=folder)
     assert torch.equal(images, load_images(scene, scene.solved, 64, 48))
     assert {path.name for path in folder.iterdir()} == {path.name for path in world.shot.run("held").iterdir()}
@@ -120,7 +120,7 @@ def test_every_method_and_preset_of_supervision_runs(world, quiet, method, super
 
 
 @pytest.mark.parametrize("host", ["hexplane", "control_points"])
-def test_a_state_can_be_asked_for_without_pulling_what_is_canonical(world, quiet, host):
+def test_state_can_be_evaluated_without_canonical_gradients(world, quiet, host):
     train_shot(world.shot, short(world, f"pull-{host}", method=host), quiet())
     model = load_run(world.shot, f"pull-{host}").model
     with torch.no_grad():
@@ -204,7 +204,7 @@ def test_config_round_trip():
             assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config
 
 
-def test_near_and_far_means_move_by_as_many_pixels(world, quiet):
+def test_near_and_far_means_move_equally_in_pixels(world, quiet):
     scene = load_scene(world.shot)
     images = load_images(scene, scene.solved, 64, 48)
     for reach, exponent in ((5.0, 1.0), (0.0, 0.0)):
@@ -239,7 +239,7 @@ def begun_in(run):
     return sorted(p.parent for p in run.glob("next/*/checkpoint.safetensors"))
 
 
-def test_a_finished_run_stays_until_one_of_other_settings_is_done(world, quiet):
+def test_finished_run_is_kept_until_its_replacement_is_done(world, quiet):
     train_shot(world.shot, short(world, "mixed"), quiet())
     run = world.shot.run("mixed")
     before = files_of(run)
@@ -265,7 +265,7 @@ def test_a_finished_run_stays_until_one_of_other_settings_is_done(world, quiet):
     assert rows == list(range(6, 61, 6))
 
 
-def test_an_evaluation_that_a_cancel_ended_is_made_when_the_run_goes_on(world, quiet, monkeypatch):
+def test_cancelled_evaluation_runs_on_resume(world, quiet, monkeypatch):
     """Two cancels in an evaluation, and two in the last one: the curve has no gap."""
     train_shot(world.shot, short(world, "whole"), quiet())
     measured, goes_on = Trainer.frame_psnrs, []
@@ -294,8 +294,10 @@ def test_an_evaluation_that_a_cancel_ended_is_made_when_the_run_goes_on(world, q
     pictures = [name for name in whole if name.startswith("previews")]
     assert len(pictures) == 10
     assert {name: whole[name] for name in pictures} == {n: digest for n, digest in holed.items() if n in pictures}
-    held, gone_on = (load_checkpoint(world.shot.run(name) / "checkpoint.safetensors")[0] for name in ("whole", "holed"))
-    assert all(torch.equal(value, gone_on[name]) for name, value in held.items())
+    from_file, resumed = (
+        load_checkpoint(world.shot.run(name) / "checkpoint.safetensors")[0] for name in ("whole", "holed")
+    )
+    assert all(torch.equal(value, resumed[name]) for name, value in from_file.items())
 
 
 def test_what_a_step_was_measured_at_is_not_measured_again_when_the_run_goes_on(world, quiet):
@@ -357,7 +359,7 @@ def test_paused_runs_of_one_name_wait_side_by_side(world, quiet):
     assert not (run / "next").exists()
 
 
-def test_a_kill_while_the_new_run_takes_its_place_is_made_up_for(world, quiet, tmp_path):
+def test_kill_during_run_replacement_is_repaired(world, quiet, tmp_path):
     """Files are replaced one after the other; the state after each replacement is built by hand."""
     shot = Shot(shutil.copytree(world.shot.root, tmp_path / "s.splannequin", ignore=shutil.ignore_patterns("runs")))
     run, old, new = shot.run("main"), tmp_path / "old", tmp_path / "new"
@@ -388,7 +390,7 @@ def test_cancelling_at_once_keeps_the_finished_checkpoint(world, quiet):
     assert load_run(world.shot, "kept").config.seed == 0
 
 
-def test_a_run_of_other_cameras_is_refused(tmp_path, quiet):
+def test_run_of_a_different_solve_is_refused(tmp_path, quiet):
     import sys
 
     build_world = sys.modules[quiet.__module__].build_world
@@ -400,7 +402,7 @@ def test_a_run_of_other_cameras_is_refused(tmp_path, quiet):
         load_run(world.shot, "main")
 
 
-def test_a_run_of_other_pictures_is_refused_and_trained_anew(tmp_path, quiet):
+def test_run_of_different_pictures_is_refused_and_retrained(tmp_path, quiet):
     """Another grade of the same footage with imported cameras, whose files are identical byte by byte."""
     import sys
 
@@ -494,8 +496,8 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wr
     """The file is complete and of the right version, but a tensor is missing or has another shape."""
     shutil.copytree(world.shot.root, tmp_path / "misfit.splannequin")
     shot = Shot.open(tmp_path / "misfit.splannequin")
-    asked = TrainParams(run="misfit", iterations=30, max_gaussians=300, method="hexplane")
-    train_shot(shot, asked, quiet())
+    params = TrainParams(run="misfit", iterations=30, max_gaussians=300, method="hexplane")
+    train_shot(shot, params, quiet())
     path = shot.run("misfit") / CHECKPOINT_FILE
     tensors, meta = load_checkpoint(path)
     if wrong == "exposure":
@@ -507,12 +509,12 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wr
         load_run(shot, "misfit")
     (shot.run("misfit") / "summary.json").unlink()
     with pytest.raises(JobError, match="does not fit this version"):
-        train_shot(shot, asked, quiet())
+        train_shot(shot, params, quiet())
 
 
 def test_a_card_that_fails_says_nothing_of_the_checkpoint():
     """The message must not ask for a new training if the checkpoint is sound."""
     for error in (torch.OutOfMemoryError("CUDA out of memory."), torch.AcceleratorError("an illegal memory access")):
         assert isinstance(error, MISFITS) and misfit(Path("checkpoint"), error, ExitCode.TRAIN) is error
-    told = misfit(Path("checkpoint"), RuntimeError("size mismatch\nfor a"), ExitCode.TRAIN)
-    assert isinstance(told, JobError) and "(RuntimeError: size mismatch)" in str(told)
+    message = misfit(Path("checkpoint"), RuntimeError("size mismatch\nfor a"), ExitCode.TRAIN)
+    assert isinstance(message, JobError) and "(RuntimeError: size mismatch)" in str(message)

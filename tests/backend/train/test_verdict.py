@@ -31,14 +31,14 @@ def lost_at(first: int, last: int, row: int, column: int, share: float = 0.8) ->
     return cells
 
 
-def test_people_who_hold_still_are_good_and_their_sway_is_told_in_pixels():
+def test_still_people_are_good_with_sway_in_pixels():
     verdict = judge(figures())
     assert verdict.lines() == ["Good. It matches the whole clip.", "Moving parts sway by up to 13 of 640 pixels."]
     assert verdict.where == []
     assert judge(figures(width=1920)).sentences[-1] == "Moving parts sway by up to 40 of 1920 pixels."
 
 
-def test_a_still_world_is_told_as_one():
+def test_static_world_is_reported():
     verdict = judge(figures(sway=0.0039, farthest=0.0045))
     assert verdict.word == "good" and "Nothing moves in it." in verdict.sentences
     assert verdict.advice == ["Any frame works as t*."]
@@ -53,7 +53,7 @@ def test_a_run_that_learnt_no_motion_is_not_taken_for_a_still_world():
     assert judge(figures(matte_moving=0.087)).word == "good", "what moves was learnt"
 
 
-def test_a_walker_is_told_with_frames_place_and_what_to_do():
+def test_walker_is_reported_with_frames_place_and_advice():
     travel = lost_at(10, 40, 1, 1, 0.22)
     verdict = judge(figures(unexplained=lost_at(10, 31, 3, 0), travel=travel, far=0.02, farthest=0.22))
     assert verdict.word == "fair"
@@ -70,18 +70,20 @@ def test_a_walker_is_told_with_frames_place_and_what_to_do():
     assert followed.instants == [] and not any("t*" in line for line in followed.advice), "shown, it stands at any t*"
 
 
-def test_one_who_walks_and_is_followed_is_told_too():
+def test_tracked_walker_is_reported():
     verdict = judge(figures(travel=lost_at(1, 74, 2, 2, 0.22), far=0.02, farthest=0.22))
     assert verdict.word == "fair" and "141 of 640" in verdict.sentences[-1] and "motion matte" in verdict.advice[0]
     spot = judge(figures(travel=lost_at(1, 74, 2, 2, 0.22), far=0.0005, farthest=0.034))
     assert spot.word == "good", "a few far pixels, as in `hall`, are nobody who walks"
 
 
-def test_what_holds_nowhere_is_poor_and_so_is_what_does_not_show_the_clip():
+def test_inconsistent_or_unlike_run_is_poor():
     verdict = judge(figures(unexplained=lost_at(1, 74, 1, 1)))
     assert verdict.word == "poor" and "frames 1 to 73, middle" in verdict.sentences[0]
     assert "If somebody walks through" in verdict.advice[0]
-    by_mattes = [judge(figures(unexplained=lost_at(1, 74, 1, 1), still_unexplained=off)).advice for off in (0.01, 0.2)]
+    by_mattes = [
+        judge(figures(unexplained=lost_at(1, 74, 1, 1), still_unexplained=share)).advice for share in (0.01, 0.2)
+    ]
     assert "Somebody walks through: choose" in by_mattes[0][0] and "solve the camera again" in by_mattes[1][0]
     dim = judge(figures(median_db=18.9, tenth_db=17.6, held_out=False))
     said = "It does not match the clip: 18.9 dB on half of its training frames, 17.6 dB on the worst tenth."
@@ -141,21 +143,21 @@ def walk_through(shot):
         write_png(path, pixels)
 
 
-def test_a_run_tells_how_far_things_travel(trained):
+def test_run_reports_travel_distance(trained):
     """The small world's patch sways by 0.4 units at depth 3.2, which is more than people who hold still."""
     world, summary = trained
-    there = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
-    true = float((there[0] - there[1])[0]) * 60.0 / 3.2
+    places = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
+    true = float((places[0] - places[1])[0]) * 60.0 / 3.2
     assert summary["travel_px"] == pytest.approx(true, rel=0.35)
     assert (summary["quality"], summary["quality_on"]) == ("Fair", "held-out frames")
     kept = read_json(world.shot.run("main") / "summary.json")
     assert kept["verdict"] == summary["verdict"] and summary["unexplained_share"] < 0.01
-    told = re.search(r"(\d+) of 64 pixels", verdict_lines(kept)[1])
-    assert told and float(told[1]) == pytest.approx(summary["farthest_px"], abs=0.56), "rounded once, and once more"
+    match = re.search(r"(\d+) of 64 pixels", verdict_lines(kept)[1])
+    assert match and float(match[1]) == pytest.approx(summary["farthest_px"], abs=0.56), "rounded once, and once more"
 
 
 @pytest.mark.parametrize("holdout", [8, 0])
-def test_somebody_who_walks_through_is_told(tmp_path, quiet, holdout):
+def test_person_walking_through_is_reported(tmp_path, quiet, holdout):
     world = sys.modules[quiet.__module__].build_world(tmp_path)
     params = TrainParams(iterations=200, max_gaussians=1500, holdout=holdout)
     walk_through(world.shot)
@@ -164,8 +166,8 @@ def test_somebody_who_walks_through_is_told(tmp_path, quiet, holdout):
     assert summary["quality"] == "Poor"
     assert summary["worst_tenth_psnr_db"] <= summary["median_psnr_db"]
     assert summary["quality_on"] == ("held-out frames" if holdout else "training frames")
-    (told,) = [e for e in report.events if e[0] == "warning" and e[1].startswith("Poor.")]
-    number = re.search(rf"([\d.]+) dB on half of its {summary['quality_on']}", told[1])
+    (warning,) = [e for e in report.events if e[0] == "warning" and e[1].startswith("Poor.")]
+    number = re.search(rf"([\d.]+) dB on half of its {summary['quality_on']}", warning[1])
     assert number and float(number[1]) == pytest.approx(summary["median_psnr_db"], abs=0.056)
-    assert "walks through" in told[2] and "solve" in told[2]
-    assert "It does not hold in frame" in told[2], "frames and place are told"
+    assert "walks through" in warning[2] and "solve" in warning[2]
+    assert "It does not hold in frame" in warning[2], "frames and place are told"

@@ -44,7 +44,7 @@ def test_known_grain_is_recovered(deviation, softness, bits):
     np.testing.assert_allclose(found.correlation, AGREEMENT, atol=0.1)
 
 
-def test_grain_that_grows_with_brightness_is_told_per_level():
+def test_grain_is_measured_per_brightness_level():
     base = scene()
     found = measure([stored(base + noise(k, 0.5) * (1.0 + 5.0 * base) / 255, 8) for k in range(6)])
     middles = (np.arange(BINS) + 0.5) / BINS
@@ -95,10 +95,10 @@ def test_drawn_grain_is_what_was_measured():
     np.testing.assert_allclose(found.correlation, AGREEMENT, atol=0.1)
 
 
-def test_grain_is_of_its_frame_alone_and_has_no_mean():
-    first, again, other = (draw(GRAIN, n, flat(0.5), (WIDTH, HEIGHT)) for n in (7, 7, 8))
+def test_grain_depends_only_on_the_frame_and_has_zero_mean():
+    first, again, next_frame = (draw(GRAIN, n, flat(0.5), (WIDTH, HEIGHT)) for n in (7, 7, 8))
     np.testing.assert_array_equal(first, again)
-    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.02
+    assert abs(np.corrcoef(first.ravel(), next_frame.ravel())[0, 1]) < 0.02
     display = linear_to_srgb(first + srgb_to_linear(np.float32(0.5))) - 0.5
     assert abs(display.mean()) < 0.05 / 255
     assert draw(GRAIN, -3, flat(0.5), (WIDTH, HEIGHT)).std() > 0
@@ -113,7 +113,7 @@ def test_grain_ends_where_the_picture_does_and_never_leaves_black_or_white():
         assert grainy.min() >= -1e-6 and grainy.max() <= 1.0 + 1e-6
 
 
-def test_a_smaller_frame_has_the_grain_of_the_plate_made_smaller():
+def test_downscaled_frame_has_downscaled_plate_grain():
     large = draw(GRAIN, 1, flat(0.5), (WIDTH, HEIGHT))
     small = draw(GRAIN, 1, flat(0.5, size=(WIDTH // 2, HEIGHT // 2)), (WIDTH, HEIGHT))
     grey = srgb_to_linear(np.float32(0.5))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from tests.backend.freeze.composite.test_compositor import H, W, board_at, build, dilate, off
+from tests.backend.freeze.composite.test_compositor import H, W, board_at, build, dilate, rms_error
 from torch_backend.deformation import Deformation, Deltas
 from torch_backend.freeze.composite.compositor import CompositeConfig, Compositor
 from torch_backend.freeze.composite.state import StateConfig, StateWeights
@@ -54,31 +54,31 @@ def make(world, mattes, source_views=None, masked=None, **config):
     return world.make(world.output(FRAME, T_STAR), compositor)
 
 
-def shows_its_own_board(world, made):
+def stale_board_share(world, composited):
     """Fraction of pixels that look like the frame's own board, where its plate shows the board and the truth at t* does
     not."""
-    (plate, on), (truth, there) = world.seen_at(FRAME), world.truth(world.output(FRAME, T_STAR))
-    gone = on & ~dilate(there, 4)
+    (plate, on), (truth, board_at_t_star) = world.seen_at(FRAME), world.truth(world.output(FRAME, T_STAR))
+    gone = on & ~dilate(board_at_t_star, 4)
     assert gone.sum() > 3000
-    near = [np.abs(np.asarray(made.color) - picture).mean(-1) for picture in (plate, truth)]
+    near = [np.abs(np.asarray(composited.color) - picture).mean(-1) for picture in (plate, truth)]
     return float((near[0] < near[1])[gone].mean())
 
 
 def test_a_matte_that_ends_short_of_what_moves_leaves_nothing_of_it(world):
     """The flow misses the outer 9 pixels of the board in the frame's own plate and in the filling plates."""
     short = {frame: erode(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
-    assert shows_its_own_board(world, make(world, short)) < 0.01
-    assert shows_its_own_board(world, make(world, short, **BLIND)) > 0.1, "else there is nothing to mend"
+    assert stale_board_share(world, make(world, short)) < 0.01
+    assert stale_board_share(world, make(world, short, **BLIND)) > 0.1, "else there is nothing to mend"
 
 
-def test_what_is_held_still_and_was_elsewhere_at_t_star_is_not_shown(world):
+def test_object_that_moved_since_t_star_is_not_shown(world):
     """Nobody moves for a second, so mattes are empty; plate t* shows the wall, and so does the frozen frame."""
     still = {frame: np.zeros((H, W), bool) for frame in range(FRAME - 2, FRAME + 3)}
-    made = make(world, still)
-    assert shows_its_own_board(world, made) < 0.01
-    assert shows_its_own_board(world, make(world, still, **BLIND)) > 0.9, "else there is nothing to mend"
+    composited = make(world, still)
+    assert stale_board_share(world, composited) < 0.01
+    assert stale_board_share(world, make(world, still, **BLIND)) > 0.9, "else there is nothing to mend"
     wall = ~dilate(world.seen_at(FRAME)[1] | world.truth(world.output(FRAME, T_STAR))[1], 24)
-    assert (made.matte.numpy()[wall] == 1.0).all(), "and nothing else is let go of"
+    assert (composited.matte.numpy()[wall] == 1.0).all(), "and nothing else is let go of"
 
 
 def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
@@ -88,23 +88,23 @@ def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
     world.run.model = replace(before, field=Stays())
     still = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
     try:
-        made, alone = make(world, still), make(world, still, **BLIND)
+        composited, without_evidence = make(world, still), make(world, still, **BLIND)
     finally:
         world.run.model = before
-    assert shows_its_own_board(world, made) < 0.1
-    assert shows_its_own_board(world, alone) > 0.9, "else there is nothing to mend"
+    assert stale_board_share(world, composited) < 0.1
+    assert stale_board_share(world, without_evidence) > 0.9, "else there is nothing to mend"
 
 
 def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
     """At the plate's time the model shows the board where the frozen render shows the static wall."""
     none = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
-    made, alone = make(world, none), make(world, none, **BLIND)
+    composited, without_evidence = make(world, none), make(world, none, **BLIND)
     gone = erode(world.seen_at(FRAME)[1], 6) & ~dilate(world.truth(world.output(FRAME, T_STAR))[1], 6)
-    assert gone.sum() > 1000 and made.matte.numpy()[gone].max() < 0.01
-    assert alone.matte.numpy()[gone].min() > 0.99, "else something else says so"
+    assert gone.sum() > 1000 and composited.matte.numpy()[gone].max() < 0.01
+    assert without_evidence.matte.numpy()[gone].min() > 0.99, "else something else says so"
 
 
-def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(world):
+def test_plate_is_kept_where_the_model_contradicts_plate_t_star(world):
     """The model has a wrong colour in a spot of the wall at all times, which is not motion."""
     spot = world.run.model.gaussians.params["means"][:, :2]
     wrong = (spot - torch.tensor([-2.2, 1.7])).norm(dim=1) < 0.4
@@ -113,13 +113,15 @@ def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(wo
     try:
         with torch.no_grad():
             colors[wrong] += 1.5
-        made = make(world, {})
-        shown = np.abs((made.splat - torch.from_numpy(world.truth(world.output(FRAME, T_STAR))[0]).float()).numpy())
-        spoilt = (shown.max(-1) > 0.2) & ~dilate(world.seen_at(FRAME)[1], 24)
-        spoilt &= ~dilate(world.truth(world.output(FRAME, T_STAR))[1], 24)
-        assert spoilt.sum() > 500
-        assert made.matte.numpy()[spoilt].mean() > 0.75
-        error = off(made.color, world.truth(world.output(FRAME, T_STAR))[0], spoilt)
+        composited = make(world, {})
+        shown = np.abs(
+            (composited.splat - torch.from_numpy(world.truth(world.output(FRAME, T_STAR))[0]).float()).numpy()
+        )
+        wrong_pixels = (shown.max(-1) > 0.2) & ~dilate(world.seen_at(FRAME)[1], 24)
+        wrong_pixels &= ~dilate(world.truth(world.output(FRAME, T_STAR))[1], 24)
+        assert wrong_pixels.sum() > 500
+        assert composited.matte.numpy()[wrong_pixels].mean() > 0.75
+        error = rms_error(composited.color, world.truth(world.output(FRAME, T_STAR))[0], wrong_pixels)
         assert error < 0.01, "residuals mend the rest"
     finally:
         with torch.no_grad():
@@ -132,20 +134,20 @@ def test_plates_that_fill_show_nothing_of_it_either(world):
     world.run.model = replace(before, field=Stays())
     try:
         mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14) if frame not in (FRAME, T_STAR)}
-        made = make(world, mattes, None)
+        composited = make(world, mattes, None)
         believed = make(world, mattes, VisibilityConfig(unexplained=1e6), state=StateConfig(noise=1e6))
     finally:
         world.run.model = before
-    assert shows_its_own_board(world, made) < 0.01
-    assert shows_its_own_board(world, believed) > 0.1, "else there is nothing to mend"
+    assert stale_board_share(world, composited) < 0.01
+    assert stale_board_share(world, believed) > 0.1, "else there is nothing to mend"
 
 
 def test_where_mattes_ended_short_the_wall_is_as_sharp_as_its_plates(world):
-    truth, there = world.truth(world.output(FRAME, T_STAR))
-    gone = world.seen_at(FRAME)[1] & ~dilate(there, 4)
+    truth, board_at_t_star = world.truth(world.output(FRAME, T_STAR))
+    gone = world.seen_at(FRAME)[1] & ~dilate(board_at_t_star, 4)
     short = {frame: erode(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
-    made = make(world, short)
-    assert off(made.color, truth, gone) < min(0.01, 0.2 * off(made.splat, truth, gone))
+    composited = make(world, short)
+    assert rms_error(composited.color, truth, gone) < min(0.01, 0.2 * rms_error(composited.splat, truth, gone))
 
 
 def test_what_moves_and_no_plate_near_t_star_shows_is_a_guess(world):
@@ -156,7 +158,7 @@ def test_what_moves_and_no_plate_near_t_star_shows_is_a_guess(world):
     seen, guessed = world.make(output), world.make(output, withheld=[n for n in range(1, 14) if n != FRAME])
     assert seen.support.numpy()[board].min() > 0.95
     assert guessed.support.numpy()[board].max() < 0.05
-    for made in (seen, guessed):
-        assert made.support.numpy()[wall].min() > 0.99
-    shares = [float(small_share(made.plate, made.support).mean()) for made in (seen, guessed)]
+    for composited in (seen, guessed):
+        assert composited.support.numpy()[wall].min() > 0.99
+    shares = [float(small_share(composited.plate, composited.support).mean()) for composited in (seen, guessed)]
     assert shares[0] - shares[1] > 0.8 * float(torch.from_numpy(board).float().mean())

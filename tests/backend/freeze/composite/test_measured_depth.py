@@ -45,10 +45,10 @@ def world(shift: float, mover: float = MOVER) -> tuple[NDArray[Any], NDArray[Any
     return inverse, moving & ~card, card
 
 
-def instant(splats_off: float, sigma: float = 0.02, hole: bool = False) -> InstantDepth:
-    """Depth at t*: splats place the moving object too far by the fraction `splats_off`; the map has the true depth."""
+def instant(splat_error: float, sigma: float = 0.02, hole: bool = False) -> InstantDepth:
+    """Depth at t*: splats place the moving object too far by the fraction `splat_error`; the map has the true depth."""
     true, moving, _ = world(0.0)
-    splats = np.where(moving, true / (1.0 + splats_off), true).astype(np.float32)
+    splats = np.where(moving, true / (1.0 + splat_error), true).astype(np.float32)
     deviation = (sigma * true).astype(np.float32)
     measured = true.copy()
     if hole:
@@ -56,7 +56,7 @@ def instant(splats_off: float, sigma: float = 0.02, hole: bool = False) -> Insta
         deviation[:, WIDTH // 2 :] = 10.0 * splats[:, WIDTH // 2 :]
     none = np.zeros_like(splats)
     pose = camera(0.0), K
-    noise = max(abs(splats_off), NOISE)
+    noise = max(abs(splat_error), NOISE)
     return InstantDepth(
         KeyView(*pose, none, none, splats, NOISE * splats),
         KeyView(*pose, none, none, measured, deviation),
@@ -65,25 +65,25 @@ def instant(splats_off: float, sigma: float = 0.02, hole: bool = False) -> Insta
     )
 
 
-def corrected(shift: float, splats_off: float, **more: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def corrected(shift: float, splat_error: float, **more: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """(depth of the mover / truth, stated relative deviation, depth of all else / truth) in a view shifted by
     `shift`."""
     true, moving, _ = world(shift)
-    splats = np.where(moving, true / (1.0 + splats_off), true).astype(np.float32)
+    splats = np.where(moving, true / (1.0 + splat_error), true).astype(np.float32)
     view = KeyView(camera(shift), K, splats, splats, splats, splats)
-    factor, deviation = instant(splats_off, **more).correction(view, moving)
+    factor, deviation = instant(splat_error, **more).correction(view, moving)
     ratio = true / (splats * factor)
     return ratio[moving], deviation[moving], ratio[~moving]
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.1, 0.3])
-@pytest.mark.parametrize("splats_off", [-0.1, 0.06])
-def test_what_moves_is_as_far_as_the_map_says_from_any_side(shift, splats_off):
-    mover, deviation, others = corrected(shift, splats_off)
-    left = abs(splats_off) * 0.02**2 / (0.02**2 + splats_off**2)
+@pytest.mark.parametrize("splat_error", [-0.1, 0.06])
+def test_what_moves_is_as_far_as_the_map_says_from_any_side(shift, splat_error):
+    mover, deviation, background = corrected(shift, splat_error)
+    left = abs(splat_error) * 0.02**2 / (0.02**2 + splat_error**2)
     assert np.median(np.abs(mover - 1.0)) < left + 0.005
-    np.testing.assert_array_equal(others, 1.0)
-    assert np.median(deviation) == pytest.approx(1.0 / np.hypot(1 / 0.02, 1 / splats_off), rel=0.1)
+    np.testing.assert_array_equal(background, 1.0)
+    assert np.median(deviation) == pytest.approx(1.0 / np.hypot(1 / 0.02, 1 / splat_error), rel=0.1)
 
 
 def test_a_map_that_is_worse_than_the_splats_hardly_counts():
@@ -110,8 +110,8 @@ def test_what_plate_t_star_does_not_show_is_not_measured_by_it():
 
 def test_a_frames_depth_is_that_of_the_map_inside_of_what_moves():
     true, moving, _ = world(0.1)
-    splats_off = 0.08
-    splats = np.where(moving, true / (1.0 + splats_off), true).astype(np.float32)
+    splat_error = 0.08
+    splats = np.where(moving, true / (1.0 + splat_error), true).astype(np.float32)
     surfaces = StillSurfaces.__new__(StillSurfaces)
     surfaces.config, surfaces.keys = SurfaceDepthConfig(), []
     picture = np.where(moving[..., None], [0.9, 0.2, 0.1], [0.3, 0.4, 0.5]).astype(np.float32)
@@ -126,8 +126,8 @@ def test_a_frames_depth_is_that_of_the_map_inside_of_what_moves():
         assert np.isfinite(sigma).all()
         return float(np.median(np.abs(true / inverse - 1.0)[inner]))
 
-    assert error(None) == pytest.approx(splats_off, rel=0.2)
-    assert error(instant(splats_off)) < 0.015
+    assert error(None) == pytest.approx(splat_error, rel=0.2)
+    assert error(instant(splat_error)) < 0.015
 
 
 def test_a_run_without_maps_has_no_measurement(trained):

@@ -22,8 +22,8 @@ RANGE = {"t_star": 105, "first": 104, "last": 105, "develop": "off"}
 def lens(trained):
     """The tiny world with a barrel lens in its solve."""
     world, _ = trained
-    told = {"version": 1, "camera_model": "SIMPLE_RADIAL", "distortion": [-0.2], "focal_px": 61.9}
-    write_json(world.shot.solve / "solve.json", told)
+    record = {"version": 1, "camera_model": "SIMPLE_RADIAL", "distortion": [-0.2], "focal_px": 61.9}
+    write_json(world.shot.solve / "solve.json", record)
     yield load_lens(world.shot)
     (world.shot.solve / "solve.json").unlink()
 
@@ -45,20 +45,20 @@ def test_the_frame_inside_is_the_take_without_overscan(trained, lens, plain, qui
         assert whole.rgba.shape == (60, 80, 4) and whole.margin == (8, 6) and frame.margin == (0, 0)
         np.testing.assert_array_equal(whole.metadata.K, frame.metadata.K)
         for name in ("rgba", "support", "motion"):
-            off = np.abs(getattr(whole, name)[6:-6, 8:-8] - getattr(frame, name))
+            difference = np.abs(getattr(whole, name)[6:-6, 8:-8] - getattr(frame, name))
             # The slope of a Gaussian's projection is clamped slightly beyond the frame; with overscan the frame is
             # larger.
-            assert off.max() < 2e-2, name
+            assert difference.max() < 2e-2, name
             if name == "rgba":
                 aside = np.abs(whole.rgba[6:-6, 9:-7] - frame.rgba).mean()
-                assert off.mean() < 0.02 * aside, "not a fraction of a pixel aside"
+                assert difference.mean() < 0.02 * aside, "not a fraction of a pixel aside"
         sigma = frame.more["DepthSigma"]
         assert sigma.shape == frame.depth.shape and (sigma[frame.depth < NO_DEPTH] > 0).all()
-        off = np.abs(whole.depth[6:-6, 8:-8] - frame.depth)
+        difference = np.abs(whole.depth[6:-6, 8:-8] - frame.depth)
         reach = 4 * SurfaceDepthConfig().radii[0] + 1  # reach of nested windows
         inner = np.s_[reach:-reach, reach:-reach]
-        assert (off / frame.depth)[inner].max() < 1e-4
-        assert (off < 2.0 * sigma).mean() > 0.99, "surfaces at the border are measured with what is beyond it"
+        assert (difference / frame.depth)[inner].max() < 1e-4
+        assert (difference < 2.0 * sigma).mean() > 0.99, "surfaces at the border are measured with what is beyond it"
         assert whole.rgba[:6, :, 3].mean() > 0.5, "there is picture beyond the frame: the wall goes on"
         np.testing.assert_array_equal(
             read_png(folder / "preview" / f"{n:06d}.png").shape, read_png(plain / "preview" / f"{n:06d}.png").shape
@@ -92,16 +92,16 @@ def test_another_overscan_makes_the_frames_stale_and_none_leaves_no_map(trained,
     assert json.loads((folder / "take.json").read_text())["redistort"] == ""
 
 
-def test_a_camera_of_ones_own_has_overscan_in_percent_and_no_map(trained, lens, quiet, tmp_path):
+def test_custom_camera_has_percent_overscan_and_no_map(trained, lens, quiet, tmp_path):
     world, _ = trained
     pose = world.viewmats[7].flatten().tolist()
     path = CameraPath(64, 48, [CameraFrame(1, pose, [90.0, 90.0, 32.0, 24.0], "blender")])
     write_json(tmp_path / "path.json", path.to_json())
-    asked = {"take": "own", "t_star": 108, "camera_path": str(tmp_path / "path.json"), "width": 64}
-    facts = freeze_shot(world.shot, FreezeParams(overscan=25.0, **asked), quiet())
+    params = {"take": "own", "t_star": 108, "camera_path": str(tmp_path / "path.json"), "width": 64}
+    facts = freeze_shot(world.shot, FreezeParams(overscan=25.0, **params), quiet())
     assert facts["margin"] == [16, 12] and facts["redistort"] == ""
     with pytest.raises(JobError, match="only known for the clip's own camera"):
-        freeze_shot(world.shot, FreezeParams(overscan=-1.0, **asked), quiet())
+        freeze_shot(world.shot, FreezeParams(overscan=-1.0, **params), quiet())
 
 
 def test_a_lens_without_a_way_back_is_said_and_the_percentage_still_rendered(trained, lens, quiet):

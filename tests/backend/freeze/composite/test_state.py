@@ -33,33 +33,36 @@ def found(world):
     views: SourceViews = Compositor(world.run, world.scene, world.plates()).source_views
     target = target_view(views, output, frozen, image, W, H)
     seen, instant = (views.seen(frame, target.points) for frame in (FRAME, T_STAR))
-    told = evidence(views, target, FRAME, seen, instant, StateConfig())
-    alone = evidence(views, target, FRAME, seen, None, StateConfig())
-    return told, alone, world.seen_at(FRAME)[1], world.truth(output)[1]
+    with_instant = evidence(views, target, FRAME, seen, instant, StateConfig())
+    without_instant = evidence(views, target, FRAME, seen, None, StateConfig())
+    return with_instant, without_instant, world.seen_at(FRAME)[1], world.truth(output)[1]
 
 
 def test_each_piece_of_evidence_is_large_where_it_should_be(found):
-    told, alone, own, there = found
-    still, gone = np.logical_not(dilate(own | there, 24)), own & np.logical_not(dilate(there, 8))
-    assert set(told) == {f.name for f in fields(StateWeights)} - {"bias"}
+    with_instant, without_instant, board_now, board_at_t_star = found
+    still, gone = (
+        np.logical_not(dilate(board_now | board_at_t_star, 24)),
+        board_now & np.logical_not(dilate(board_at_t_star, 8)),
+    )
+    assert set(with_instant) == {f.name for f in fields(StateWeights)} - {"bias"}
     for name in ("change", "contradiction", "gain"):
-        value = told[name].numpy()
+        value = with_instant[name].numpy()
         assert value[gone].mean() > value[still].mean() + 1.0, name
-    moved = told["scene_flow"].numpy()
-    assert moved[there].mean() > 2.0 and moved[still].max() < 0.1
-    assert not alone["contradiction"].any(), "plate t* may not be used"
-    assert (told["change"] <= alone["change"]).all(), "plate t* says how noisy renders are"
+    moved = with_instant["scene_flow"].numpy()
+    assert moved[board_at_t_star].mean() > 2.0 and moved[still].max() < 0.1
+    assert not without_instant["contradiction"].any(), "plate t* may not be used"
+    assert (with_instant["change"] <= without_instant["change"]).all(), "plate t* says how noisy renders are"
 
 
 def test_odds_are_a_weighted_sum_and_a_still_world_keeps_its_plate_to_the_bit(found):
-    told, _, own, there = found
+    with_instant, _, board_now, board_at_t_star = found
     config = StateConfig(smoothing=0.0)
     weights = config.weights
-    want = weights.bias + sum(getattr(weights, name) * told[name].double() for name in told)
-    torch.testing.assert_close(log_odds(told, config, 1.0).double(), want, rtol=1e-5, atol=1e-5)
-    share = let_go(log_odds(told, StateConfig(), W / 640), StateConfig()).numpy()
-    assert (share[np.logical_not(dilate(own | there, 40))] == 0.0).all()
-    assert (share[own & np.logical_not(dilate(there, 8))] > 0.99).mean() > 0.95
+    want = weights.bias + sum(getattr(weights, name) * with_instant[name].double() for name in with_instant)
+    torch.testing.assert_close(log_odds(with_instant, config, 1.0).double(), want, rtol=1e-5, atol=1e-5)
+    share = let_go(log_odds(with_instant, StateConfig(), W / 640), StateConfig()).numpy()
+    assert (share[np.logical_not(dilate(board_now | board_at_t_star, 40))] == 0.0).all()
+    assert (share[board_now & np.logical_not(dilate(board_at_t_star, 8))] > 0.99).mean() > 0.95
 
 
 def test_log_odds_become_a_soft_border():
@@ -75,10 +78,10 @@ def test_fitting_finds_the_evidence_that_tells_and_leaves_the_rest():
     wrong = torch.zeros(2, 32, 40)
     wrong[:, 8:24, 10:30] = 1.0
     truth = torch.full((2, 32, 40, 3), 0.5)
-    told = torch.randn(2, 32, 40, len(NAMES)) * 0.3
-    told[..., NAMES.index("change")] += 2.0 * wrong
+    values = torch.randn(2, 32, 40, len(NAMES)) * 0.3
+    values[..., NAMES.index("change")] += 2.0 * wrong
     plate, filled = truth + 0.3 * wrong[..., None], truth + 0.1 * (1.0 - wrong[..., None])
-    case = Case("made", told, plate, filled, truth, wrong > 0.5, 1.0)
+    case = Case("made", values, plate, filled, truth, wrong > 0.5, 1.0)
     weights = fit([case])
     assert weights.change > 3.0 * max(abs(getattr(weights, name)) for name in NAMES if name != "change")
     figures = judged(case, weights)

@@ -86,10 +86,10 @@ def test_windows_over_an_edge_do_not_smear_it() -> None:
     true = np.where(columns < 30, 0.5 + 0.002 * columns, 0.2).astype(np.float32)
     noisy = true + np.random.default_rng(1).normal(0.0, 0.01, true.shape).astype(np.float32)
     smooth, variance = smoothed(noisy, np.full_like(noisy, 1e4), (2, 4), SurfaceDepthConfig().uneven)
-    off = np.abs(smooth - true)[5:-5]
-    assert off[:, 5:27].max() < 0.02 and off[:, 33:-5].max() < 0.02
-    assert off[:, 29:31].mean() < 0.05, "the step of 0.36 stays within a pixel"
-    assert (off < 2.0 * np.sqrt(variance)[5:-5])[:, 5:27].mean() > 0.9
+    error = np.abs(smooth - true)[5:-5]
+    assert error[:, 5:27].max() < 0.02 and error[:, 33:-5].max() < 0.02
+    assert error[:, 29:31].mean() < 0.05, "the step of 0.36 stays within a pixel"
+    assert (error < 2.0 * np.sqrt(variance)[5:-5])[:, 5:27].mean() > 0.9
 
 
 def test_a_ragged_edge_takes_the_pictures_line() -> None:
@@ -124,6 +124,6 @@ def test_key_views_that_agree_outvote_splats_that_are_wrong() -> None:
     inverse, _ = combined(surfaces, view)
     middle = np.s_[8:-8, 16:-16]
     assert np.abs(inverse / true - 1.0)[middle].max() < 0.01
-    alone = combined(surfaces, replace(view, still=0.0 * view.still))
-    np.testing.assert_allclose(alone[0], view.inverse, rtol=1e-6)
-    np.testing.assert_allclose(alone[1], view.sigma, rtol=1e-3)
+    without_views = combined(surfaces, replace(view, still=0.0 * view.still))
+    np.testing.assert_allclose(without_views[0], view.inverse, rtol=1e-6)
+    np.testing.assert_allclose(without_views[1], view.sigma, rtol=1e-3)

@@ -99,8 +99,8 @@ def test_plate_matte_and_fill_give_the_frozen_frame_back_from_the_file(tmp_path,
     np.testing.assert_array_equal(warp.alpha, alpha)
     found = apply_warp(plate.cpu(), warp)
     assert torch.equal(found[:, :20], plate.cpu()[:, :20]), "where nothing moves it is the plate, bit for bit"
-    own = matte.cpu().double().numpy()[..., None] * reference(plate.cpu().numpy(), st.cpu().numpy())
-    expected = own + fill.cpu().double().numpy()
+    from_plate = matte.cpu().double().numpy()[..., None] * reference(plate.cpu().numpy(), st.cpu().numpy())
+    expected = from_plate + fill.cpu().double().numpy()
     assert np.abs(expected).max() > 40 and expected.min() < -0.1
     assert (np.abs(found.numpy() - expected) < 1e-3 * np.maximum(np.abs(expected), 0.1)).all()
     assert [p.name for p in path.parent.iterdir()] == ["é.exr"]

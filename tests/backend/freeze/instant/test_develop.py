@@ -56,7 +56,7 @@ def trained(tmp_path_factory, quiet):
 
 
 @pytest.fixture(scope="module")
-def made(trained, quiet):
+def developed_world(trained, quiet):
     """(run, scene, instant of the field, developed instant, which is stored)."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -85,7 +85,7 @@ def shown(run, scene, frozen, frame):
 
 def scores(world, run, scene, frozen, frames=(102, 105, 110, 115)):
     """(dB of moving pixels at t*, dB of static pixels), compared with the truth from several poses."""
-    off = {"moving": [], "still": []}
+    errors = {"moving": [], "still": []}
     for frame in frames:
         truth = world.image(frame - 101, (T_STAR - 101) / 15)
         bare = {name: value.clone() for name, value in world.state.items()}
@@ -93,24 +93,24 @@ def scores(world, run, scene, frozen, frames=(102, 105, 110, 115)):
         behind = dataclasses.replace(world, state=bare).image(frame - 101, 0.0)
         patch = (truth - behind).abs().amax(-1) > 0.1
         error = (shown(run, scene, frozen, frame) - truth).square().mean(-1)
-        off["moving"].append(error[patch])
-        off["still"].append(error[(truth - behind).abs().amax(-1) < 0.01])
-    return tuple(-10.0 * float(torch.cat(off[what]).mean().log10()) for what in ("moving", "still"))
+        errors["moving"].append(error[patch])
+        errors["still"].append(error[(truth - behind).abs().amax(-1) < 0.01])
+    return tuple(-10.0 * float(torch.cat(errors[what]).mean().log10()) for what in ("moving", "still"))
 
 
-def same(one, other):
+def same(one, second):
     return (
-        all(torch.equal(one.state[name], other.state[name]) for name in one.state)
-        and torch.equal(one.support, other.support)
-        and torch.equal(one.motion, other.motion)
-        and torch.equal(one.descent.motion, other.descent.motion)
-        and (one.origin is None if other.origin is None else torch.equal(one.origin, other.origin))
-        and all(torch.equal(v, other.descent.state[n]) for n, v in one.descent.state.items())
+        all(torch.equal(one.state[name], second.state[name]) for name in one.state)
+        and torch.equal(one.support, second.support)
+        and torch.equal(one.motion, second.motion)
+        and torch.equal(one.descent.motion, second.descent.motion)
+        and (one.origin is None if second.origin is None else torch.equal(one.origin, second.origin))
+        and all(torch.equal(v, second.descent.state[n]) for n, v in one.descent.state.items())
     )
 
 
-def test_each_row_knows_what_repaired_it(made):
-    run, scene, frozen, now = made
+def test_each_row_knows_what_repaired_it(developed_world):
+    run, scene, frozen, now = developed_world
     steps = repairs(config_for(run))
     changed = torch.zeros(len(frozen.support), dtype=torch.bool)
     for name, value in frozen.state.items():
@@ -123,8 +123,8 @@ def test_each_row_knows_what_repaired_it(made):
     assert not bool(untouched.origin.any()) and untouched.state is frozen.state
 
 
-def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, made):
-    run, scene, frozen, _ = made
+def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, developed_world):
+    run, scene, frozen, _ = developed_world
     travel = SceneFlow(run, scene, frozen, T_STAR)
     assert len(travel.rows) > 10
     for frame in (101, 109, 116):
@@ -134,8 +134,8 @@ def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, mad
             torch.testing.assert_close(value, then[name], rtol=1e-5, atol=1e-5)
 
 
-def test_developed_gaussians_travel_with_those_they_descend_from(made):
-    run, scene, frozen, now = made
+def test_developed_gaussians_travel_with_those_they_descend_from(developed_world):
+    run, scene, frozen, now = developed_world
     stage = MovingScene(run, scene, now, T_STAR)
     assert all(torch.equal(value, now.state[name]) for name, value in stage.at(T_STAR).state.items())
     then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state["means"] - frozen.state["means"]
@@ -178,7 +178,7 @@ def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
         assert bool((torch.sigmoid(moved["opacity_logits"][added]) < 1e-6).all())
 
 
-def test_floaters_are_hidden_and_nothing_that_stands_still(trained):
+def test_floaters_are_hidden_and_static_gaussians_kept(trained):
     """A part of the moving Gaussians has a colour that plate t* does not show there."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -189,8 +189,8 @@ def test_floaters_are_hidden_and_nothing_that_stands_still(trained):
     mended = with_missing(run, scene, recoloured, T_STAR, motion_mattes(world.shot))
     changed = mended.state["opacity_logits"][: len(frozen.support)] != frozen.state["opacity_logits"]
     assert bool(changed.any()) and not bool(changed[frozen.motion < 0.5].any())
-    others = torch.ones(len(changed), dtype=torch.bool).index_fill(0, wrong, False)
-    assert int(changed[wrong].sum()) > 4 * int(changed[others].sum())
+    correct = torch.ones(len(changed), dtype=torch.bool).index_fill(0, wrong, False)
+    assert int(changed[wrong].sum()) > 4 * int(changed[correct].sum())
 
 
 def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
@@ -211,9 +211,9 @@ def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
         )
 
     monkeypatch.setattr(repairs_module, "with_missing", grown)
-    made = developed(world.shot, run, scene, t_star, frozen)
-    assert len(made.support) == len(frozen.support) + 5 and len(made.origin) == len(made.support)
-    assert same(load_developed(world.shot, run, t_star, frozen), made)
+    result = developed(world.shot, run, scene, t_star, frozen)
+    assert len(result.support) == len(frozen.support) + 5 and len(result.origin) == len(result.support)
+    assert same(load_developed(world.shot, run, t_star, frozen), result)
     path = developed_path(run, t_star)
     tensors, meta = load_checkpoint(path)
     tensors["state.means"] = tensors["state.means"][:-1].clone()
@@ -242,13 +242,13 @@ def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(tra
     shut = (torn.motion > 0.5) & (mended.motion < 0.5)
     assert float(shut[wall].float().mean()) > 0.8, "what is seen of it"
     stays = mended.motion[patch] > 0.5
-    ours, twins = (scores(world, run, scene, f) for f in (mended, with_still_means(run, torn, run.model.open_rows())))
+    ours, static = (scores(world, run, scene, f) for f in (mended, with_still_means(run, torn, run.model.open_rows())))
     was_moving, was_still = scores(world, run, scene, torn)
-    assert ours[1] > was_still + 2.0 and ours[1] > twins[1] - 0.05, "no worse than static where nothing moves"
-    assert ours[0] > was_moving - 0.1 and ours[0] > twins[0] + 1.0 and bool(stays.any())
+    assert ours[1] > was_still + 2.0 and ours[1] > static[1] - 0.05, "no worse than static where nothing moves"
+    assert ours[0] > was_moving - 0.1 and ours[0] > static[0] + 1.0 and bool(stays.any())
 
 
-def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(trained):
+def test_nearer_plates_are_used_even_where_the_object_moves(trained):
     """The wall is wrongly opened at t*, and mattes call everything moving, so no static pixel contradicts it."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -261,7 +261,7 @@ def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(train
     assert closed[0] == 0.0 and closed[1] > 0.8
 
 
-def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
+def test_far_moving_gaussians_stay_open_without_a_matte(trained):
     """`doubted` closes Gaussians that sway outside of moving mattes, but never those that moved far."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -277,7 +277,7 @@ def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
     assert left[1e9, 1.0] > 1.2 * left[1e9, 1e9]
 
 
-def test_what_is_seen_from_afar(trained):
+def test_undersampled_gaussians_are_found(trained):
     """A Gaussian is undersampled if some frame that saw it was less than half as far away."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
@@ -294,22 +294,22 @@ def test_what_is_seen_from_afar(trained):
     assert undersampled(run, scene, means, scene.frames[first], 20.0).tolist() == [False] * 4
 
 
-def test_of_what_t_star_sees_from_afar_nothing_is_learnt_where_it_moves(trained):
+def test_undersampled_moving_gaussians_are_not_trained(trained):
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, rows, mattes = field(run, scene), run.model.open_rows(), motion_mattes(world.shot)
     config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005)
-    made = develop(run, scene, frozen, T_STAR, mattes, config)
-    changed = (made.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
-    afar = undersampled(run, scene, frozen.state["means"], T_STAR, 1.005)
-    far, near = rows[afar[rows]], rows[~afar[rows]]
+    result = develop(run, scene, frozen, T_STAR, mattes, config)
+    changed = (result.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
+    undersampled_rows = undersampled(run, scene, frozen.state["means"], T_STAR, 1.005)
+    far, near = rows[undersampled_rows[rows]], rows[~undersampled_rows[rows]]
     assert len(far) > 8 and len(near) > 8, "or the test says nothing"
     assert float(changed[near].float().mean()) > 0.9
     assert float(changed[far].float().mean()) < 0.3, "those that no matte calls moving"
     assert float(changed[frozen.motion < 0.5].float().mean()) > 0.9, "others show it as it is, too"
 
 
-def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(trained):
+def test_undersampled_closed_gaussians_are_not_trained(trained):
     """The Gaussians are closed, and one frame's matte calls them moving; other frames must not teach those seen from
     afar."""
     world, _ = trained
@@ -321,17 +321,17 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(tr
         return torch.full((scene.height, scene.width), float(frame == once))
 
     config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005, probes=1000)
-    made = develop(run, scene, frozen, T_STAR, moving, config)
-    changed = (made.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
+    result = develop(run, scene, frozen, T_STAR, moving, config)
+    changed = (result.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
     plates = WorkingPlates(scene, config.width, moving, device=frozen.support.device)
     moves = plates.moving_share(frozen, once) > 0.5
-    afar = undersampled(run, scene, frozen.state["means"], T_STAR, 1.005)
+    undersampled_rows = undersampled(run, scene, frozen.state["means"], T_STAR, 1.005)
     closed = frozen.motion < 0.5
-    assert int((closed & afar & moves).sum()) > 8 and int((closed & ~afar & moves).sum()) > 8, (
-        "or the test says nothing"
-    )
-    assert not changed[afar & moves].any()
-    assert float(changed[closed & ~afar & moves].float().mean()) > 0.9
+    assert (
+        int((closed & undersampled_rows & moves).sum()) > 8 and int((closed & ~undersampled_rows & moves).sum()) > 8
+    ), "or the test says nothing"
+    assert not changed[undersampled_rows & moves].any()
+    assert float(changed[closed & ~undersampled_rows & moves].float().mean()) > 0.9
 
 
 def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(tmp_path, quiet):
@@ -348,9 +348,9 @@ def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(tmp_path, quiet)
     assert float((blind.motion[rows] > 0.5).float().mean()) > 0.35 and now > was - 2.0
 
 
-def test_a_developed_instant_is_nearer_to_the_truth(trained, made):
+def test_a_developed_instant_is_nearer_to_the_truth(trained, developed_world):
     world, _ = trained
-    run, scene, frozen, now = made
+    run, scene, frozen, now = developed_world
     (moving, still), (was_moving, was_still) = (scores(world, run, scene, f) for f in (now, frozen))
     assert (
         still > was_still + 0.3 and moving > was_moving - 0.3
@@ -370,19 +370,19 @@ def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):
     assert moving > was_moving + 6.0 and still > was_still - 0.5
 
 
-def test_what_has_gone_in_the_other_plates_is_not_erased(trained, made):
+def test_object_missing_in_neighbour_plates_is_not_erased(trained, developed_world):
     """In plates far from t* the patch is elsewhere, and its place at t* shows the wall."""
     world, _ = trained
-    run, scene, frozen, _ = made
+    run, scene, frozen, _ = developed_world
     config = DevelopConfig(steps=200, gain=-99.0)  # accepts any change on held-out frames
     now = develop(run, scene, frozen, T_STAR, motion_mattes(world.shot), config)
     before, after = (scores(world, run, scene, f, (113, 114, 115))[0] for f in (frozen, now))
     assert after > before - 1.0 and not torch.equal(now.state["sh0"], frozen.state["sh0"])
 
 
-def test_a_kept_instant_is_read_back_to_the_bit(trained, made):
+def test_a_kept_instant_is_read_back_to_the_bit(trained, developed_world):
     world, _ = trained
-    run, _, frozen, now = made
+    run, _, frozen, now = developed_world
     again = load_developed(world.shot, run, T_STAR, frozen)
     assert again is not None and same(again, now)
     assert load_developed(world.shot, run, T_STAR, frozen, SHORT) is None, "developed otherwise"
@@ -390,9 +390,9 @@ def test_a_kept_instant_is_read_back_to_the_bit(trained, made):
     assert load_developed(world.shot, run, 106, frozen) is None
 
 
-def test_where_still_pixels_gain_too_little_what_moves_is_developed_alone(trained, made):
+def test_only_movers_are_developed_if_static_pixels_gain_little(trained, developed_world):
     world, _ = trained
-    run, scene, frozen, _ = made
+    run, scene, frozen, _ = developed_world
     config, path = DevelopConfig(steps=150, gain=99.0), developed_path(run, 106)
     frozen = field(run, scene, 106)
     try:
@@ -417,9 +417,9 @@ def plate_error(run, scene, shot, frozen, frame):
     return float((shown(run, scene, frozen, frame) - plate).square().mean(-1)[moves].mean())
 
 
-def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_neighbours_bear(apart, monkeypatch):
+def test_evidence_of_plate_t_star_is_weighted_by_neighbour_plates(shot_copy, monkeypatch):
     """In the neighbouring plates the moving object has another colour."""
-    shot, run, scene, frozen = apart
+    shot, run, scene, frozen = shot_copy
     path = scene.image_path(scene.frames.index(T_STAR))
     plate, moves = read_png(path), load_motion(shot, T_STAR) > 127
     plate[moves] = 255 - plate[moves]
@@ -434,7 +434,7 @@ def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_ne
 
 
 @pytest.fixture
-def apart(trained, tmp_path):
+def shot_copy(trained, tmp_path):
     """(shot, run, scene, instant of the field) of a copy of the shot that the test may change."""
     world, _ = trained
     root = shutil.copytree(world.shot.root, tmp_path / "tiny.splannequin", ignore=shutil.ignore_patterns("takes"))
@@ -444,8 +444,8 @@ def apart(trained, tmp_path):
     return shot, run, scene, field(run, scene)
 
 
-def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
-    shot, run, scene, frozen = apart
+def test_damaged_or_mismatched_instant_is_recomputed(shot_copy):
+    shot, run, scene, frozen = shot_copy
     make = lambda: developed(shot, run, scene, T_STAR, frozen, SHORT)  # noqa: E731
     first, path = make(), developed_path(run, T_STAR)
     whole, meta = path.read_bytes(), read_meta(path)
@@ -464,19 +464,25 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
     assert again is not None and same(again, first)
 
 
-def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(apart):
-    shot, run, scene, _ = apart
-    held, config = 109, DevelopConfig(steps=100, gain=-99.0)
-    assert held not in run.train_frames
-    frozen, mattes = field(run, scene, held), motion_mattes(shot)
-    made = [develop(run, scene, apply_static_baseline(run, scene, frozen, held, mattes), held, mattes, config)]
-    scene.image_path(scene.frames.index(held)).write_bytes(b"nobody reads it")
-    made.append(develop(run, scene, apply_static_baseline(run, scene, frozen, held, mattes), held, mattes, config))
-    assert same(*made) and not torch.equal(made[0].state["sh0"], made[0].descent.state["sh0"])
+def test_held_out_instant_is_trained_from_adjacent_plates(shot_copy):
+    shot, run, scene, _ = shot_copy
+    frame, config = 109, DevelopConfig(steps=100, gain=-99.0)
+    assert frame not in run.train_frames
+    frozen, mattes = field(run, scene, frame), motion_mattes(shot)
+    developed_world = [
+        develop(run, scene, apply_static_baseline(run, scene, frozen, frame, mattes), frame, mattes, config)
+    ]
+    scene.image_path(scene.frames.index(frame)).write_bytes(b"nobody reads it")
+    developed_world.append(
+        develop(run, scene, apply_static_baseline(run, scene, frozen, frame, mattes), frame, mattes, config)
+    )
+    assert same(*developed_world) and not torch.equal(
+        developed_world[0].state["sh0"], developed_world[0].descent.state["sh0"]
+    )
 
 
-def test_instants_of_another_training_go_when_one_is_kept(apart):
-    shot, run, scene, frozen = apart
+def test_instants_of_another_training_go_when_one_is_kept(shot_copy):
+    shot, run, scene, frozen = shot_copy
     path = developed_path(run, T_STAR)
     for stem, stamp in (("000103", ["other"]), ("000104", run.stamp), ("mine", ["other"])):
         save_checkpoint(path.with_name(f"{stem}.safetensors"), {"a": torch.zeros(1)}, {"run": stamp})
@@ -484,8 +490,8 @@ def test_instants_of_another_training_go_when_one_is_kept(apart):
     assert sorted(p.stem for p in path.parent.iterdir()) == ["000104", "000105", "mine"]
 
 
-def test_cancelling_leaves_nothing(apart, quiet):
-    shot, run, scene, _ = apart
+def test_cancelling_leaves_nothing(shot_copy, quiet):
+    shot, run, scene, _ = shot_copy
     report = quiet(cancel_at=("developing", 0.01))
     with pytest.raises(Cancelled):
         Instants(shot, run, scene, "nearest", [T_STAR]).prepare([T_STAR], report)
@@ -493,16 +499,18 @@ def test_cancelling_leaves_nothing(apart, quiet):
     assert len(report.events) == 1 + math.ceil(0.01 * config_for(run).steps), "it stops at once"
 
 
-def test_where_it_cannot_be_kept_the_take_is_made_all_the_same(apart, trained, made, quiet):
-    shot, run, _, _ = apart
+def test_take_is_finished_even_if_the_instant_cannot_be_stored(shot_copy, trained, developed_world, quiet):
+    shot, run, _, _ = shot_copy
     world, _ = trained
     (run.folder / "developed").write_text("in the way")
     report = quiet()
     ask = dict(t_star=T_STAR, first=105, last=106, detail="off", grain=False)
     assert freeze_shot(shot, FreezeParams(**ask), report)["developed"] == [T_STAR]
-    told = [event[1] for event in report.events if event[0] == "warning"]
+    warnings = [event[1] for event in report.events if event[0] == "warning"]
     assert (
-        len(told) == 1 and told[0].startswith("The developed instant was not saved:") and "is not a folder" in told[0]
+        len(warnings) == 1
+        and warnings[0].startswith("The developed instant was not saved:")
+        and "is not a folder" in warnings[0]
     )
     assert (run.folder / "developed").read_text() == "in the way"
     freeze_shot(world.shot, FreezeParams(take="kept", **ask), quiet())
@@ -510,7 +518,7 @@ def test_where_it_cannot_be_kept_the_take_is_made_all_the_same(apart, trained, m
     np.testing.assert_array_equal(*pictures)
 
 
-def test_frames_are_made_anew_when_developing_is_switched(trained, made, quiet):
+def test_switching_develop_rerenders_frames(trained, developed_world, quiet):
     world, _ = trained
     keys, facts, frame = [], [], world.shot.take("switched") / "000105.exr"
     for wanted in ("off", "off", "on", "on", "off"):
@@ -521,24 +529,24 @@ def test_frames_are_made_anew_when_developing_is_switched(trained, made, quiet):
     assert keys[0] == keys[1] != keys[2] == keys[3] and keys[4][0] == keys[0][0] != keys[2][0]
 
 
-def test_of_keyed_instants_those_of_trained_frames_are_developed_and_of_too_many_none(trained, made):
+def test_keyed_instants_of_trained_frames_are_developed_up_to_a_limit(trained, developed_world):
     world, _ = trained
-    run, scene = made[:2]
-    trained_on, held_out = run.train_frames, sorted({*scene.frames} - {*run.train_frames})
+    run, scene = developed_world[:2]
+    trained_on, held_out_frames = run.train_frames, sorted({*scene.frames} - {*run.train_frames})
 
     def of(t_stars, on=True):
         return Instants(world.shot, run, scene, "nearest", map(float, t_stars), on).frames
 
-    assert held_out and of([*trained_on[:3] * 4, held_out[0], 104.5]) == trained_on[:3]
+    assert held_out_frames and of([*trained_on[:3] * 4, held_out_frames[0], 104.5]) == trained_on[:3]
     assert of(trained_on[:MOST]) == trained_on[:MOST] and of(trained_on[: MOST + 1]) == []
     assert of(trained_on[:2], on=False) == []
     keys = {developed_key(world.shot, run, t, query=query) for t in (104, 105) for query in ("nearest", "plain")}
     assert len(keys) == 4
 
 
-def test_scrubbing_shows_an_instant_as_soon_as_it_has_been_developed(trained, made, tmp_path):
+def test_scrubbing_shows_an_instant_as_soon_as_it_has_been_developed(trained, developed_world, tmp_path):
     world, _ = trained
-    run, scene, frozen, now = made
+    run, scene, frozen, now = developed_world
     session, path, i = LiveSession(world.shot, "main", "cpu"), developed_path(run, T_STAR), T_STAR - 101
     view = LiveView(1, 1, world.viewmats[i].flatten().tolist(), [60.0, 60.0, 32.0, 24.0], 64, 48, T_STAR, T_STAR)
 
@@ -552,8 +560,8 @@ def test_scrubbing_shows_an_instant_as_soon_as_it_has_been_developed(trained, ma
         before = seen()
     finally:
         shutil.move(tmp_path / path.name, path)
-    for told, picture, expected in ((*before, frozen), (*seen(develop=False), frozen), (*seen(), now)):
-        assert told == (expected is now)
+    for warnings, picture, expected in ((*before, frozen), (*seen(develop=False), frozen), (*seen(), now)):
+        assert warnings == (expected is now)
         np.testing.assert_allclose(picture, shown(run, scene, expected, T_STAR), atol=2e-3)
     assert seen(detail=True)[0] and not seen(t_star=108.0)[0]
     assert np.abs(before[1] - seen()[1]).mean() > 1e-3
@@ -572,8 +580,8 @@ def test_a_run_in_which_nothing_moves_is_developed_at_its_ends(world, quiet, t_s
     assert errors[1] < 0.9 * errors[0] and not developed_path(run, t_star).exists()
 
 
-def test_instants_are_developed_as_large_as_the_run(made):
-    run = made[0]
+def test_instants_are_developed_as_large_as_the_run(developed_world):
+    run = developed_world[0]
     assert config_for(run) == DevelopConfig()
     larger = config_for(dataclasses.replace(run, width=1280))
     assert larger.width == 1280 and larger.steps == 2 * DevelopConfig().steps

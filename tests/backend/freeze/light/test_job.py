@@ -155,8 +155,8 @@ PLACEMENT = contract.Placement([0, 0, 2, 1, 2, 0, 0, 5, 0, 2, 0, -1, 0, 0, 0, 1]
 def lit(shot, run="none", checkpoint=""):
     """Folder of a take whose splats are the sphere around POINT, without its bottom."""
     folder = TakeFolder(shot.take("lit"))
-    told = {"version": 1, "take": "lit", "run": run, "checkpoint": checkpoint, "t_star_frame": 105}
-    write_json(folder.facts, {**told, "placement": PLACEMENT.to_json()})
+    facts = {"version": 1, "take": "lit", "run": run, "checkpoint": checkpoint, "t_star_frame": 105}
+    write_json(folder.facts, {**facts, "placement": PLACEMENT.to_json()})
     write_json(shot.placement, PLACEMENT.to_json())
     write_ply(folder.ply, *ball(missing=lambda along: along[:, 2] < -0.5))
     return folder
@@ -183,10 +183,10 @@ def read(path):
 
 def test_the_panorama_is_the_scenes_and_says_what_was_filled(take, quiet):
     world, folder = take
-    told = make_light(world.shot, params(), quiet(), SMALL)
-    assert told["made"] and told["position"] == POINT.tolist()
-    assert told["filled"] == pytest.approx(0.22, abs=0.03), "the cap below -0.5, less a rim of splats"
-    light = read(told["light"])
+    result = make_light(world.shot, params(), quiet(), SMALL)
+    assert result["made"] and result["position"] == POINT.tolist()
+    assert result["filled"] == pytest.approx(0.22, abs=0.03), "the cap below -0.5, less a rim of splats"
+    light = read(result["light"])
     along = truth(SMALL.width)
     srgb, cosine = of_the_nearest(along)
     sure = (cosine > 0.9) & (along[..., 2] > -0.4)
@@ -194,17 +194,17 @@ def test_the_panorama_is_the_scenes_and_says_what_was_filled(take, quiet):
     assert np.abs(np.diff(light[-8:], axis=0)).max() < 0.03 and np.ptp(light[-1], axis=0).max() < 0.05
     cap = to_light(np.array(COLORS[0, 0, -1]))
     assert np.abs(light[-1].mean(0) - cap).max() > 0.1, "nobody saw what is below: it is not known"
-    facts = contract.light_of_take(folder, told["key"])
-    assert facts.filled == told["filled"] and facts.position == POINT.tolist()
+    facts = contract.light_of_take(folder, result["key"])
+    assert facts.filled == result["filled"] and facts.position == POINT.tolist()
 
 
-def test_it_is_made_once_and_anew_for_another_point_or_take(take, quiet):
+def test_light_is_recomputed_for_a_new_point_or_take(take, quiet):
     world, folder = take
     first = make_light(world.shot, params(), quiet(), SMALL)
     before = read(first["light"])
     assert not make_light(world.shot, params(), quiet(), SMALL)["made"]
-    other = make_light(world.shot, params(position="1.5,-0.5,0.8"), quiet(), SMALL)
-    assert other["made"] and other["key"] != first["key"]
+    second = make_light(world.shot, params(position="1.5,-0.5,0.8"), quiet(), SMALL)
+    assert second["made"] and second["key"] != first["key"]
     with open(first["light"], "r+b") as file:
         file.truncate(1000)
     assert contract.light_of_take(folder, first["key"]) is None
@@ -216,7 +216,7 @@ def test_it_is_made_once_and_anew_for_another_point_or_take(take, quiet):
     folder.facts.write_text(json.dumps(facts), encoding="utf-8")
 
 
-def test_a_shot_that_was_moved_since_is_seen_where_it_stands_now(take, quiet, tmp_path):
+def test_light_uses_the_current_shot_placement(take, quiet, tmp_path):
     """The same point of the frozen scene, after the scene was rotated by a quarter turn and scaled by two."""
     world, folder = take
     still = read(make_light(world.shot, params(), quiet(), SMALL)["light"])
@@ -227,9 +227,9 @@ def test_a_shot_that_was_moved_since_is_seen_where_it_stands_now(take, quiet, tm
     file.write_text(json.dumps(contract.Placement(matrix.ravel().tolist()).to_json()), encoding="utf-8")
     moved = turn[:3, :3] @ POINT + turn[:3, 3]
     position = ",".join(map(repr, moved.tolist()))
-    told = make_light(world.shot, params(position=position, placement=str(file)), quiet(), SMALL)
+    result = make_light(world.shot, params(position=position, placement=str(file)), quiet(), SMALL)
     # +X has become +Y, a quarter of the picture to the left.
-    assert np.abs(read(told["light"]) - np.roll(still, -SMALL.width // 4, axis=1)).mean() < 0.005
+    assert np.abs(read(result["light"]) - np.roll(still, -SMALL.width // 4, axis=1)).mean() < 0.005
 
 
 def test_the_light_is_exposed_as_at_the_instant(trained_copy, quiet):
@@ -248,14 +248,14 @@ def test_the_light_is_exposed_as_at_the_instant(trained_copy, quiet):
     assert not [event for event in report.events if event[0] == "warning"]
 
 
-def test_a_run_that_is_gone_costs_the_exposure_and_says_so(take, quiet):
+def test_missing_run_drops_exposure_with_a_warning(take, quiet):
     world, _ = take
     report = quiet()
     make_light(world.shot, params(position="1.5,-0.5,0.76"), report, SMALL)
     assert [event for event in report.events if event[0] == "warning"]
 
 
-def test_what_cannot_be_made_is_a_sentence(take, quiet):
+def test_uncreatable_paths_give_a_readable_error(take, quiet):
     world, folder = take
     with pytest.raises(JobError, match="no finished take"):
         make_light(world.shot, params(take="nowhere"), quiet())

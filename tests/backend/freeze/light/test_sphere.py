@@ -38,11 +38,11 @@ def test_faces_make_one_picture_without_seams():
         ray = np.stack([*np.meshgrid(pixel, pixel), np.ones((side, side))], -1)
         return smooth((ray / np.linalg.norm(ray, axis=-1, keepdims=True)) @ rotation).astype(np.float32)
 
-    made = sphere.panorama(WIDTH, face)
-    np.testing.assert_allclose(made, smooth(true_directions(WIDTH)), atol=2e-3)
+    picture = sphere.panorama(WIDTH, face)
+    np.testing.assert_allclose(picture, smooth(true_directions(WIDTH)), atol=2e-3)
 
 
-def test_a_cap_is_filled_smoothly_and_its_share_is_told():
+def test_filled_cap_is_smooth_and_its_share_reported():
     along = true_directions(256)
     known = smooth(along)
     known[along[..., 0] < 0.5] = 0.0  # unknown in three quarters of the sphere, including both poles and the seam

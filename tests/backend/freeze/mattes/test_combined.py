@@ -36,8 +36,8 @@ def world(trained_copy, quiet, tmp_path_factory):
     """The tiny world with a take at each instant, and mattes of the patch in both takes."""
     world = trained_copy
     for name, t_star in INSTANTS.items():
-        asked = FreezeParams(take=name, t_star=t_star, first=FIRST, last=LAST, passes=True)
-        freeze_shot(world.shot, asked, quiet())
+        params = FreezeParams(take=name, t_star=t_star, first=FIRST, last=LAST, passes=True)
+        freeze_shot(world.shot, params, quiet())
         mask = covered(world, 107, t_star).astype(np.uint8)
         outline, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         row = {"name": "patch", "frame": 107, "polygon": (max(outline, key=len)[:, 0] + 0.5).tolist()}
@@ -57,15 +57,15 @@ def error(world, take, number, t, where):
     return float(np.square(frame_of(world, take, number).rgba[..., :3] - truth)[where].mean())
 
 
-def test_a_thing_stands_as_another_instant_has_it(world, quiet):
-    told = combine(world.shot, CombineParams(take="both", base="early", things="patch=late"), quiet())
-    assert told["frames"] == LAST - FIRST + 1 and told["combined"]["things"] == {"patch": "late"}
+def test_object_can_come_from_a_second_instant(world, quiet):
+    result = combine(world.shot, CombineParams(take="both", base="early", things="patch=late"), quiet())
+    assert result["frames"] == LAST - FIRST + 1 and result["combined"]["things"] == {"patch": "late"}
     everywhere = np.ones((48, 64), bool)
-    ours, takes, apart = [], [], []
+    ours, takes, uncombined = [], [], []
     for n in range(FIRST, LAST + 1):
         ours.append(error(world, "both", n, INSTANTS["late"], everywhere))
         takes.append(error(world, "late", n, INSTANTS["late"], everywhere))
-        apart.append(error(world, "early", n, INSTANTS["late"], everywhere))
+        uncombined.append(error(world, "early", n, INSTANTS["late"], everywhere))
         combined_frame, early = frame_of(world, "both", n), frame_of(world, "early", n)
         near = cv2.dilate(np.float32(covered(world, n, 105) | covered(world, n, 113)), np.ones((15, 15))) > 0
         for layer in ("rgba", "depth", "support"):
@@ -75,13 +75,13 @@ def test_a_thing_stands_as_another_instant_has_it(world, quiet):
         assert combined_frame.more.keys() == early.more.keys() >= {"Vector", "Normal", "Position", "DepthSigma"}
     # At most half a dB worse than the take of that instant alone, whose other pixels show the same world. Mattes at 64
     # pixels have errors of one pixel.
-    assert np.mean(ours) <= np.mean(takes) * 10**0.05 and np.mean(ours) < 0.5 * np.mean(apart)
+    assert np.mean(ours) <= np.mean(takes) * 10**0.05 and np.mean(ours) < 0.5 * np.mean(uncombined)
     preview = read_png(TakeFolder(world.shot.take("both")).preview(107)).astype(int)
-    alone = read_png(TakeFolder(world.shot.take("late")).preview(107)).astype(int)
-    assert np.abs(preview - alone)[covered(world, 107, 113)].mean() < 3
+    late_preview = read_png(TakeFolder(world.shot.take("late")).preview(107)).astype(int)
+    assert np.abs(preview - late_preview)[covered(world, 107, 113)].mean() < 3
 
 
-def test_a_thing_lives_on_while_all_else_stands(world, quiet):
+def test_live_object_moves_while_the_rest_is_frozen(world, quiet):
     combine(world.shot, CombineParams(take="alive", base="early", things="patch=live"), quiet())
     for n in (104, 109, 111):
         frame, now = frame_of(world, "alive", n), covered(world, n, n)
@@ -90,7 +90,7 @@ def test_a_thing_lives_on_while_all_else_stands(world, quiet):
         assert (frame.detail.source[inside] == n).mean() > 0.95 and (frame.detail.plate[inside] > 0.95).mean() > 0.95
 
 
-def test_what_is_there_stays_and_what_changed_is_made_again(world, quiet):
+def test_unchanged_frames_are_kept_and_changed_ones_recomputed(world, quiet):
     params = CombineParams(take="again", base="early", things="patch=late")
     combine(world.shot, params, quiet())
     folder = TakeFolder(world.shot.take("again"))
@@ -129,12 +129,12 @@ def test_what_cannot_be_combined_is_said(world, quiet):
     refused("has no matte", base="wide")
 
 
-def test_a_mask_takes_one_layer_or_the_other():
+def test_mask_selects_between_two_layers():
     base = frame_like(1.0)
-    made = combined(base, frame_like(3.0), np.float32([[0.0, 0.25], [0.75, 1.0]]))
-    np.testing.assert_allclose(made.rgba[..., 0], [[1.0, 1.5], [2.5, 3.0]])
-    np.testing.assert_array_equal(made.depth, [[1.0, 1.0], [3.0, 3.0]])
-    np.testing.assert_array_equal(made.more["Position"][..., 2], [[1.0, 1.0], [3.0, 3.0]])
+    result = combined(base, frame_like(3.0), np.float32([[0.0, 0.25], [0.75, 1.0]]))
+    np.testing.assert_allclose(result.rgba[..., 0], [[1.0, 1.5], [2.5, 3.0]])
+    np.testing.assert_array_equal(result.depth, [[1.0, 1.0], [3.0, 3.0]])
+    np.testing.assert_array_equal(result.more["Position"][..., 2], [[1.0, 1.0], [3.0, 3.0]])
 
 
 def frame_like(value):
@@ -156,7 +156,7 @@ class Lone(Source):
         return self.kept
 
 
-def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
+def test_live_matte_includes_touching_pixels_with_soft_borders():
     matte, motion = np.zeros((40, 60), np.float32), np.zeros((40, 60), np.float32)
     matte[10:20, 10:20], motion[15:30, 18:25], motion[5:10, 50:55] = 1.0, 1.0, 1.0
     alive = with_motion(matte, np.zeros_like(matte), motion)
@@ -167,9 +167,9 @@ def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
     assert parted[15, 19] == 1.0 and parted[25, 22] == 0.0 and np.array_equal(parted[matte > 0.5], matte[matte > 0.5])
     depth = np.where(motion > 0.5, 5.0, 2.0).astype(np.float32)  # all moving and touched pixels are far behind
     frame = dataclasses.replace(frame_like(0.0), motion=motion, depth=depth)
-    alone = Lone(matte)
-    assert alone.shows("it", 1, frame, is_live=False)[2, 25, 22] == 0.0
-    assert alone.shows("it", 1, frame, is_live=True)[2, 25, 22] == 1.0
+    lone = Lone(matte)
+    assert lone.shows("it", 1, frame, is_live=False)[2, 25, 22] == 0.0
+    assert lone.shows("it", 1, frame, is_live=True)[2, 25, 22] == 1.0
     soft = dilated(matte, 640)
     assert soft[15, 15] == pytest.approx(1.0, abs=1e-3) and 0.2 < soft[15, 23] < 1.0 and soft[15, 32] == 0.0
     assert torch.from_numpy(soft).isfinite().all()

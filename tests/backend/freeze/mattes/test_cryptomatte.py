@@ -40,12 +40,14 @@ def test_a_file_gives_back_every_matte_by_its_name(tmp_path):
     path = write_cryptomatte(tmp_path / "000001.exr", mattes, key="abc")
     image = oiio.ImageBuf(str(path))
     spec = image.spec()
-    told = {a.name: a.value for a in spec.extra_attribs if a.name.startswith("cryptomatte/")}
-    (folder,) = {name.rsplit("/", 1)[0] for name in told}
-    layer = told[f"{folder}/name"]
+    attributes = {a.name: a.value for a in spec.extra_attribs if a.name.startswith("cryptomatte/")}
+    (folder,) = {name.rsplit("/", 1)[0] for name in attributes}
+    layer = attributes[f"{folder}/name"]
     assert folder == f"cryptomatte/{murmur3(layer.encode()):08x}"[:19]
-    assert told[f"{folder}/hash"] == "MurmurHash3_32" and told[f"{folder}/conversion"] == "uint32_to_float32"
-    known = json.loads(told[f"{folder}/manifest"])
+    assert (
+        attributes[f"{folder}/hash"] == "MurmurHash3_32" and attributes[f"{folder}/conversion"] == "uint32_to_float32"
+    )
+    known = json.loads(attributes[f"{folder}/manifest"])
     assert set(known) == set(mattes)
     assert {str(form) for form in spec.channelformats or [spec.format]} == {"float"}
     names = [f"{layer}{n:02d}.{channel}" for n in range(PAIRS // 2) for channel in "RGBA"]

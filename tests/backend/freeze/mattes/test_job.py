@@ -61,36 +61,36 @@ def overlaps(world, folder, name="patch"):
 
 def test_one_lasso_is_a_matte_at_every_pose(take, quiet):
     world, folder, lassos = take
-    told = make_mattes(world.shot, lassos(patch(world)), quiet())
+    result = make_mattes(world.shot, lassos(patch(world)), quiet())
     found = overlaps(world, folder)
     assert np.mean(list(found.values())) > 0.85 and min(found.values()) > 0.75
-    assert list(told["mattes"]) == ["patch"] and told["frames"] == 9
+    assert list(result["mattes"]) == ["patch"] and result["frames"] == 9
     assert sorted(p.name for p in folder.cryptomattes.iterdir()) == [f"{n:06d}.exr" for n in range(104, 113)]
     assert [lasso.name for lasso in stored_lassos(folder, 64, 48)] == ["patch"]
 
 
-def test_what_is_right_stays_and_what_is_stale_is_made_again(take, quiet):
+def test_current_mattes_are_kept_and_stale_ones_recomputed(take, quiet):
     world, folder, lassos = take
     make_mattes(world.shot, lassos(patch(world)), quiet())
     first = folder.matte_frames("patch") / "000106.exr"
     before = first.stat().st_mtime_ns
-    told = make_mattes(world.shot, lassos(CORNER), quiet())
-    assert told["made"] == ["corner"] and sorted(told["mattes"]) == ["corner", "patch"]
+    result = make_mattes(world.shot, lassos(CORNER), quiet())
+    assert result["made"] == ["corner"] and sorted(result["mattes"]) == ["corner", "patch"]
     assert first.stat().st_mtime_ns == before
     assert make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())["made"] == []
     first.write_bytes(b"cut off")
     assert make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())["made"] == ["patch"]
     assert read_matte(first, (0, 0)).any()
     freeze_shot(world.shot, FreezeParams(take=folder.root.name, t_star=106, first=104, last=112, detail="off"), quiet())
-    told = make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())
-    assert sorted(told["made"]) == ["corner", "patch"]
+    result = make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())
+    assert sorted(result["made"]) == ["corner", "patch"]
 
 
-def test_a_matte_is_removed_and_the_other_stays(take, quiet):
+def test_removing_one_matte_keeps_the_second(take, quiet):
     world, folder, lassos = take
     make_mattes(world.shot, lassos(patch(world), CORNER), quiet())
-    told = make_mattes(world.shot, MatteParams(take=folder.root.name, remove="corner"), quiet())
-    assert list(told["mattes"]) == ["patch"] and told["made"] == []
+    result = make_mattes(world.shot, MatteParams(take=folder.root.name, remove="corner"), quiet())
+    assert list(result["mattes"]) == ["patch"] and result["made"] == []
     assert [p.name for p in folder.single_mattes.iterdir()] == ["patch"]
     make_mattes(world.shot, MatteParams(take=folder.root.name, remove="patch"), quiet())
     assert not list(folder.single_mattes.iterdir()) and not list(folder.cryptomattes.iterdir())
@@ -131,7 +131,7 @@ def test_wrong_lassos_are_sentences(take, quiet, row, word):
         make_mattes(world.shot, lassos(CORNER, {**CORNER, **row}), quiet())
 
 
-def test_a_take_that_is_not_there_and_no_lassos_are_sentences(take, quiet):
+def test_missing_take_or_lassos_give_readable_errors(take, quiet):
     world, folder, _ = take
     with pytest.raises(JobError, match="no finished take"):
         make_mattes(world.shot, MatteParams(take="nowhere"), quiet())

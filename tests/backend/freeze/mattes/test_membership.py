@@ -38,10 +38,10 @@ def test_a_vote_is_the_share_of_what_is_seen():
     assert torch.allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
-def test_who_stands_outside_of_the_picture_is_not_seen():
+def test_gaussian_outside_the_picture_gets_no_vote():
     frozen = scene([[1.3, 0.0, 2.0], [0.0, 0.0, 2.0]], [0.5, 0.2], [3.0, 3.0])
-    told = vote(frozen, VIEW, K, torch.ones(24, 32, 1), torch.full((24, 32), 2.0))
-    assert told[0] == 0.0 < told[1]
+    votes = vote(frozen, VIEW, K, torch.ones(24, 32, 1), torch.full((24, 32), 2.0))
+    assert votes[0] == 0.0 < votes[1]
 
 
 def test_a_wall_that_shines_through_a_person_is_none_of_them():
@@ -68,7 +68,7 @@ def test_members_are_rendered_as_shares_of_what_is_known():
     assert abs(float(middle[0]) - 0.8) < 1e-3 and 0.3 < float(middle[1]) < 0.7
 
 
-def test_what_is_far_from_a_thing_and_was_not_seen_is_none_of_it():
+def test_distant_unseen_gaussians_are_not_members():
     line = torch.stack([torch.linspace(0.0, 1.0, 101), torch.zeros(101), torch.zeros(101)], dim=1)
     means = torch.cat([line, torch.tensor([[1.0, 0.5 * RIM, 0.0], [1.0, 3.0 * RIM, 0.0], [0.5, 2.0, 0.0]])])
     votes = torch.zeros(104, 2)

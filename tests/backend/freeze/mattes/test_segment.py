@@ -13,13 +13,13 @@ def disc(shape, centre, radius):
 def ring(centre, radius, wobble, seed=0, corners=40):
     """Lasso around a disc with errors of up to `wobble` pixels."""
     turn = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
-    away = radius + np.random.default_rng(seed).uniform(-wobble, wobble, corners)
-    return np.stack([centre[0] + away * np.cos(turn), centre[1] + away * np.sin(turn)], axis=1)
+    radii = radius + np.random.default_rng(seed).uniform(-wobble, wobble, corners)
+    return np.stack([centre[0] + radii * np.cos(turn), centre[1] + radii * np.sin(turn)], axis=1)
 
 
-def painted(mask, thing, rest, seed=3):
+def painted(mask, object_color, rest, seed=3):
     noise = np.random.default_rng(seed).normal(0.0, 12.0, (*mask.shape, 3))
-    return np.clip(np.where(mask[..., None], thing, rest) + noise, 0, 255).astype(np.uint8)
+    return np.clip(np.where(mask[..., None], object_color, rest) + noise, 0, 255).astype(np.uint8)
 
 
 def overlap(matte, mask):
@@ -42,7 +42,7 @@ def test_a_sloppy_lasso_finds_the_outline_by_colour():
     assert overlap(segment_lasso(picture, depth, lasso), mask) > 0.98 > 0.97 > drawn
 
 
-def test_depth_tells_apart_what_has_one_colour():
+def test_depth_separates_objects_of_one_colour():
     mask = disc((160, 220), (110, 80), 45)
     picture = painted(mask, (110, 110, 110), (110, 110, 110))
     lasso = ring((110, 80), 45, 4.0)
@@ -51,11 +51,11 @@ def test_depth_tells_apart_what_has_one_colour():
     assert overlap(segment_lasso(picture, depth, lasso), mask) > max(0.965, alike)
 
 
-def test_a_matte_of_splats_that_is_off_moves_to_the_edge_of_the_picture():
-    mask, off = disc((160, 220), (110, 80), 45), disc((160, 220), (112, 79), 44)
+def test_shifted_splat_matte_is_aligned_to_picture_edges():
+    mask, shifted = disc((160, 220), (110, 80), 45), disc((160, 220), (112, 79), 44)
     picture = painted(mask, (170, 90, 60), (70, 110, 130))
     depth, known = np.full(mask.shape, 3.0, np.float32), np.ones(mask.shape, np.float32)
-    rendered = off.astype(np.float32)
+    rendered = shifted.astype(np.float32)
     assert overlap(refine(picture, depth, rendered, known), mask) > 0.98 > overlap(rendered, mask)
 
 

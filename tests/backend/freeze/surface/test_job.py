@@ -35,12 +35,12 @@ def in_solve(folder):
 
 def test_the_surface_is_the_true_one(take, quiet):
     world, folder = take
-    told = make_surface(world.shot, SurfaceParams(take="solid"), quiet())
-    assert told["made"] and told["triangles"] > 500
+    result = make_surface(world.shot, SurfaceParams(take="solid"), quiet())
+    assert result["made"] and result["triangles"] > 500
     points, triangles, people, colors = in_solve(folder)
     patch = world.at((T_STAR - 101) / 15)["means"][world.moving].double().numpy()
     low, high = patch.min(0), patch.max(0)
-    off = []
+    distances = []
     for viewmat in world.viewmats:
         state = world.at((T_STAR - 101) / 15)
         shown = rasterize(**state, viewmats=viewmat[None], Ks=world.K[None], width=64, height=48, with_depth=True)
@@ -50,8 +50,8 @@ def test_the_surface_is_the_true_one(take, quiet):
         x, y = (np.floor(60 * seen[:, i] / seen[:, 2] + c).astype(int) for i, c in ((0, 32), (1, 24)))
         within = (x >= 0) & (x < 64) & (y >= 0) & (y < 48)
         depth = truth[np.clip(y, 0, 47), np.clip(x, 0, 63)]
-        off.append(np.where(within, np.abs(seen[:, 2] - depth) / depth, np.inf))
-    of_two_plates = np.sort(off, axis=0)[1]
+        distances.append(np.where(within, np.abs(seen[:, 2] - depth) / depth, np.inf))
+    of_two_plates = np.sort(distances, axis=0)[1]
     assert np.isfinite(of_two_plates).mean() > 0.9
     assert np.median(of_two_plates) < 0.01
     middles = points[triangles].mean(1)
@@ -64,7 +64,7 @@ def test_the_surface_is_the_true_one(take, quiet):
     assert red[:, 0].mean() > 2 * red[:, 1:].mean(), "the patch is red"
 
 
-def test_it_is_kept_and_made_anew_with_the_take(take, quiet):
+def test_surface_is_cached_and_recomputed_with_the_take(take, quiet):
     world, folder = take
     make_surface(world.shot, SurfaceParams(take="solid"), quiet())
     before = folder.surface.read_bytes()
@@ -91,7 +91,7 @@ def test_a_placed_take_has_a_placed_surface(take, quiet):
     np.testing.assert_allclose(in_solve(folder)[0], points, atol=1e-4)
 
 
-def test_what_cannot_be_made_is_a_sentence(take, quiet):
+def test_uncreatable_paths_give_a_readable_error(take, quiet):
     world, folder = take
     with pytest.raises(JobError, match="no finished take"):
         make_surface(world.shot, SurfaceParams(take="nowhere"), quiet())
@@ -106,7 +106,7 @@ def test_what_cannot_be_made_is_a_sentence(take, quiet):
     folder.facts.write_text(json.dumps(facts), encoding="utf-8")
 
 
-def test_a_strangers_file_is_not_believed(take, quiet):
+def test_foreign_surface_file_is_rejected(take, quiet):
     world, folder = take
     make_surface(world.shot, SurfaceParams(take="solid"), quiet())
     whole = folder.surface.read_bytes()

@@ -32,7 +32,7 @@ def seen(x: float, noise: float = 0.0) -> View:
     return View(viewmat, K, depth.astype(np.float32), sigma, color, is_ball)
 
 
-def off(points):
+def distance_from_truth(points):
     """Distance of points [N, 3] from the true surfaces, float64."""
     points = points.astype(np.float64)
     return np.minimum(np.abs(points[:, 2] - WALL), np.abs(np.linalg.norm(points - CENTRE, axis=1) - RADIUS))
@@ -61,8 +61,8 @@ def test_a_ball_before_a_wall_is_found(noise):
     views = [seen(x, noise) for x in np.linspace(-0.8, 0.8, 9)]
     volume = fuse(views)
     vertices, triangles = extract(volume)
-    assert np.median(off(vertices)) < 0.002 * WALL
-    assert np.quantile(off(vertices), 0.9) < 0.01 * WALL
+    assert np.median(distance_from_truth(vertices)) < 0.002 * WALL
+    assert np.quantile(distance_from_truth(vertices), 0.9) < 0.01 * WALL
     a, b, c = (vertices[triangles[:, n]].astype(np.float64) for n in range(3))
     normals = np.cross(b - a, c - a)
     of_wall = np.abs(a[:, 2] - WALL) < 0.04
@@ -83,14 +83,14 @@ def test_a_plane_is_exact_and_whole():
     assert len(np.unique(triangles)) - len(often) + len(triangles) == 1, "one sheet without holes (Euler)"
 
 
-def test_voxels_are_pixels_and_no_more_than_there_may_be():
+def test_voxel_size_matches_pixels_and_count_is_bounded():
     views = [seen(0.0, 0.0)]
     flat = Contraction(np.zeros(3), 100.0)
     assert resolved(views, flat) == pytest.approx(4.0 / FOCAL, rel=0.05)
     few = fuse(views, SurfaceConfig(voxels=100_000))
     assert few.distance.size <= 100_000 and few.voxel > fuse(views).voxel
     vertices, _ = extract(few)
-    assert np.median(off(vertices)) < 0.01 * WALL
+    assert np.median(distance_from_truth(vertices)) < 0.01 * WALL
 
 
 def test_nothing_seen_is_an_error():

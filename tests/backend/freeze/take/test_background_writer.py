@@ -8,7 +8,7 @@ from torch_backend.contract import Cancelled
 from torch_backend.freeze.take.background_writer import MAX_BACKGROUND_BYTES, BackgroundWriter
 
 
-def test_a_frame_is_written_while_the_next_is_made():
+def test_frame_is_written_while_the_next_is_rendered():
     free, done = threading.Event(), []
     with BackgroundWriter() as out:
         out.write(lambda: done.append(free.wait(20)), 1)
@@ -36,7 +36,7 @@ def test_one_is_written_at_a_time_and_in_order():
     assert done == list(range(20)) and most == 1
 
 
-def test_a_frame_that_is_too_large_to_be_held_is_written_at_once():
+def test_oversized_frame_is_written_synchronously():
     thread = []
     with BackgroundWriter() as out:
         out.write(lambda: thread.append(threading.current_thread()), MAX_BACKGROUND_BYTES + 1)

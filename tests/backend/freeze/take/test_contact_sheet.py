@@ -31,7 +31,7 @@ def box(mask):
     return y.min(), y.max() + 1, x.min(), x.max() + 1
 
 
-def test_plates_stand_above_their_frozen_frames_in_order(tmp_path):
+def test_contact_sheet_shows_plates_above_their_frozen_frames(tmp_path):
     plates, frozen = pictures(tmp_path, "plates", 4), pictures(tmp_path, "frozen", 4)
     path = write_contact_sheet(tmp_path / "Größe 測試" / "sheet.png", plates, frozen, [12, 13, 14, 15], "shot: t* = 13")
     sheet = read_png(path)
@@ -85,7 +85,7 @@ def test_frames_that_will_not_hold_lose_a_corner_of_the_frozen_picture(tmp_path)
     assert is_colour(after[top, right - 1], ALARM) and is_colour(after[top, right - 30], (110, 0, 250))
 
 
-def test_a_note_stands_under_the_title_in_as_many_lines_as_it_needs(tmp_path):
+def test_note_is_wrapped_under_the_title(tmp_path):
     frozen = pictures(tmp_path, "frozen", 2)
     sheets = {}
     for count in (0, 3, 40):

@@ -48,15 +48,15 @@ def take(trained_copy, quiet, tmp_path_factory):
     """Deep take of the world: a patch at depth 3.2 in front of a wall at 4."""
     file = tmp_path_factory.mktemp("placed") / "placement.json"
     write_json(file, PLACED.to_json())
-    asked = FreezeParams(
+    params = FreezeParams(
         take="deep", t_star=105, first=104, last=106, deep=True, only_missing=True, placement=str(file)
     )
-    facts = freeze_shot(trained_copy.shot, asked, quiet())
+    facts = freeze_shot(trained_copy.shot, params, quiet())
     assert facts["deep"]
-    return trained_copy.shot.take("deep"), asked
+    return trained_copy.shot.take("deep"), params
 
 
-def test_over_each_other_the_samples_are_the_frame(take):
+def test_flattened_deep_samples_equal_the_frame(take):
     folder, _ = take
     for n in (104, 105, 106):
         frame, file = read_frozen_exr(folder / f"{n:06d}.exr"), folder / "deep" / f"{n:06d}.exr"
@@ -114,15 +114,15 @@ def test_two_surfaces_become_two_samples_of_the_frames_colour():
     assert depth.tolist() == [[[1.0] * 4], [[2.0] * 4]]
 
 
-def test_only_frames_that_lack_a_whole_deep_picture_are_made_again(take, trained_copy, quiet):
-    folder, asked = take
+def test_only_frames_without_a_complete_deep_file_are_rerendered(take, trained_copy, quiet):
+    folder, params = take
     files = [folder / "deep" / f"{n:06d}.exr" for n in (104, 105, 106)]
-    made = [path.stat().st_mtime_ns for path in files]
+    times = [path.stat().st_mtime_ns for path in files]
     whole = files[1].read_bytes()
     files[1].write_bytes(whole[:-200])
-    freeze_shot(trained_copy.shot, asked, quiet())
+    freeze_shot(trained_copy.shot, params, quiet())
     now = [path.stat().st_mtime_ns for path in files]
-    assert (now[0], now[2]) == (made[0], made[2]) and now[1] != made[1]
+    assert (now[0], now[2]) == (times[0], times[2]) and now[1] != times[1]
     assert files[1].read_bytes() == whole
 
 
@@ -132,7 +132,7 @@ def test_blurred_takes_have_none(trained_copy, quiet, tmp_path):
         one.viewmat[3] += 0.1 * n
     (tmp_path / "own.json").write_text(json.dumps(path.to_json()))
     ask = dict(t_star=105, deep=True, shutter=180.0, develop="off")
-    asked = FreezeParams(take="blurred", camera_path=str(tmp_path / "own.json"), **ask)
+    params = FreezeParams(take="blurred", camera_path=str(tmp_path / "own.json"), **ask)
     with pytest.raises(JobError, match="no deep EXRs"):
-        freeze_shot(trained_copy.shot, asked, quiet())
+        freeze_shot(trained_copy.shot, params, quiet())
     assert not trained_copy.shot.take("blurred").exists()

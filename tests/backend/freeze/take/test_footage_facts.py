@@ -67,7 +67,7 @@ def test_footage_without_a_lens(tmp_path, shot_of):
     assert facts["probe"] == pytest.approx(srgb_to_linear(PROBE)) and facts["map"] == "" and not list(take.iterdir())
 
 
-def test_the_map_takes_the_lens_away_as_plates_do_at_full_size(tmp_path, shot_of):
+def test_full_size_map_undistorts_like_the_plates(tmp_path, shot_of):
     """The map gives positions in the footage's pixels; sampled with it, the footage equals the plate."""
     shot = shot_of(pictures(tmp_path / "plate"), radial=-0.2)
     facts, take = facts_of(shot)
@@ -82,7 +82,7 @@ def test_the_map_takes_the_lens_away_as_plates_do_at_full_size(tmp_path, shot_of
     assert float((seen - plate).abs()[3:-3, 3:-3].mean()) < 0.01 < float((raw - plate).abs().mean())
 
 
-def test_the_map_is_made_once_for_a_solve(tmp_path, shot_of):
+def test_map_is_computed_once_per_solve(tmp_path, shot_of):
     shot = shot_of(pictures(tmp_path / "plate"), radial=-0.2)
     _, take = facts_of(shot)
     file = take / "stmap" / "undistort.exr"
@@ -101,12 +101,12 @@ def test_log_footage_says_what_light_it_means(tmp_path, shot_of):
     assert facts["probe"] == pytest.approx(expected, rel=1e-4) and facts["space"] == "S-Log3 S-Gamut3 (OCIO)"
 
 
-def test_what_other_programs_would_show_otherwise_is_told(tmp_path, shot_of):
+def test_footage_that_blender_shows_differently_is_recorded(tmp_path, shot_of):
     facts, _ = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr", PixelAspectRatio=2.0)))
     assert facts["unlike"] == "its pixels are not square"
 
 
-def test_a_rate_that_varies_is_told(tmp_path, shot_of):
+def test_variable_frame_rate_is_recorded(tmp_path, shot_of):
     shot = shot_of(pictures(tmp_path / "plate"))
     record = json.loads(shot.listing.read_text())
     record["frames"][-1]["seconds"] += 0.03
@@ -121,7 +121,7 @@ def test_footage_that_is_gone_or_another_is_not_named(tmp_path, shot_of):
     assert facts_of(shot)[0] == {}
 
 
-def test_how_a_picture_is_turned_is_told(tmp_path, shot_of):
+def test_picture_orientation_is_recorded(tmp_path, shot_of):
     """Blender shows pictures as stored, without their orientation tag."""
     facts = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr", Orientation=6)))[0]
     assert facts["size"] == [96, 128] and facts["unlike"] == "its pictures are turned clockwise by their header"

@@ -44,8 +44,8 @@ def test_a_video_that_cannot_be_replaced_is_missed_in_words_and_ends_no_freeze(q
     (tmp_path / "video.mp4").mkdir()
     with missable("video", report):
         write_video(tmp_path / "video.mp4", frames, 24.0)
-    (told,) = report.events
-    assert told[0] == "warning" and "The video is not written" in told[1] and "video.mp4" in told[1]
+    (event,) = report.events
+    assert event[0] == "warning" and "The video is not written" in event[1] and "video.mp4" in event[1]
     with pytest.raises(OSError, match="No space"), missable("video", report):
         raise OSError(28, "No space left on device", "video.mp4")
 
@@ -53,10 +53,10 @@ def test_a_video_that_cannot_be_replaced_is_missed_in_words_and_ends_no_freeze(q
 @pytest.fixture(scope="module")
 def takes(trained, quiet):
     world, _ = trained
-    asked = [(t, detail) for t in (105, 112) for detail in ("on", "off")]
+    cases = [(t, detail) for t in (105, 112) for detail in ("on", "off")]
     return {
         (t, detail): freeze_shot(world.shot, FreezeParams(take=f"t{t}{detail}", t_star=t, detail=detail), quiet())
-        for t, detail in asked
+        for t, detail in cases
     }
 
 
@@ -82,7 +82,7 @@ def test_every_pose_shows_the_world_at_t_star(trained, takes):
 
 
 @pytest.mark.parametrize("detail", ["on", "off"])
-def test_two_instants_differ_where_the_patch_moved_and_nowhere_else(trained, takes, detail):
+def test_two_instants_differ_only_where_the_patch_moved(trained, takes, detail):
     world, _ = trained
     early, late = frozen(world, 105, 108, detail), frozen(world, 112, 108, detail)
     difference = np.abs(early.rgba[..., :3] - late.rgba[..., :3]).mean(-1)
@@ -109,15 +109,15 @@ def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(tra
             if "was not trained on" in message:  # this message comes between loading the model and the first frame
                 save_checkpoint(run / "checkpoint.safetensors", tensors, meta)
 
-    asked = dict(run=run.name, take="meanwhile", t_star=109, first=105, last=105, only_missing=True)
-    asked |= dict(detail="off", develop="off")
+    options = dict(run=run.name, take="meanwhile", t_star=109, first=105, last=105, only_missing=True)
+    options |= dict(detail="off", develop="off")
     frame, report = world.shot.take("meanwhile") / "000105.exr", TrainsMeanwhile()
-    freeze_shot(world.shot, FreezeParams(**asked), report)
+    freeze_shot(world.shot, FreezeParams(**options), report)
     old, again = read_frozen_exr(frame), quiet()
-    freeze_shot(world.shot, FreezeParams(**asked), again)
+    freeze_shot(world.shot, FreezeParams(**options), again)
     assert np.abs(read_frozen_exr(frame).rgba - old.rgba).mean() > 0.1, "rendered again, from the new model"
-    told = ["trained during the freeze" in "".join(str(e) for e in r.events) for r in (report, again)]
-    assert told == [True, False]
+    event = ["trained during the freeze" in "".join(str(e) for e in r.events) for r in (report, again)]
+    assert event == [True, False]
 
 
 def test_a_freeze_says_why_it_does_not_use_the_card(trained, quiet, monkeypatch):
@@ -125,9 +125,9 @@ def test_a_freeze_says_why_it_does_not_use_the_card(trained, quiet, monkeypatch)
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
     monkeypatch.setattr(device, "card_verdict", lambda: SelfTest(problem="a frame comes out wrong on it"))
     small = dict(take="no card", t_star=105, first=105, last=105, detail="off", develop="off")
-    for asked, times in (("auto", 1), ("cpu", 0)):
+    for cases, times in (("auto", 1), ("cpu", 0)):
         report = quiet()
-        freeze_shot(world.shot, FreezeParams(**small, device=asked), report)
+        freeze_shot(world.shot, FreezeParams(**small, device=cases), report)
         said = [event[1] for event in report.events if event[0] == "warning" and "graphics card" in event[1]]
         assert len(said) == times and all(s.startswith("Freezing uses the processor") for s in said)
 
@@ -188,21 +188,23 @@ def test_only_missing_frames_are_rendered_again(trained, quiet):
 
 
 @pytest.mark.parametrize("detail", ["on", "off"])
-def test_frames_written_beside_the_next_are_those_written_at_once(trained, quiet, monkeypatch, detail):
+def test_frames_written_in_a_thread_equal_those_written_directly(trained, quiet, monkeypatch, detail):
     world, _ = trained
-    asked = dict(t_star=108, first=103, last=106, detail=detail, develop="off")
-    for take, held in (("beside", 1 << 40), ("at once", -1)):
-        monkeypatch.setattr(background_writer, "MAX_BACKGROUND_BYTES", held)
-        freeze_shot(world.shot, FreezeParams(take=take, **asked), quiet())
-    beside, at_once = world.shot.take("beside"), world.shot.take("at once")
-    pictures = sorted(p.relative_to(beside) for p in beside.rglob("*.exr"))
+    options = dict(t_star=108, first=103, last=106, detail=detail, develop="off")
+    for take, limit in (("beside", 1 << 40), ("at once", -1)):
+        monkeypatch.setattr(background_writer, "MAX_BACKGROUND_BYTES", limit)
+        freeze_shot(world.shot, FreezeParams(take=take, **options), quiet())
+    threaded, at_once = world.shot.take("beside"), world.shot.take("at once")
+    pictures = sorted(p.relative_to(threaded) for p in threaded.rglob("*.exr"))
     assert len(pictures) == (8 if detail == "on" else 4)
     for picture in pictures:
-        one, other = (oiio.ImageBuf(str(folder / picture)).get_pixels(oiio.FLOAT) for folder in (beside, at_once))
-        assert np.array_equal(one, other, equal_nan=True), picture
+        first_file, second_file = (
+            oiio.ImageBuf(str(folder / picture)).get_pixels(oiio.FLOAT) for folder in (threaded, at_once)
+        )
+        assert np.array_equal(first_file, second_file, equal_nan=True), picture
     for n in range(103, 107):
-        one, other = (folder / "preview" / f"{n:06d}.png" for folder in (beside, at_once))
-        assert one.read_bytes() == other.read_bytes()
+        first_file, second_file = (folder / "preview" / f"{n:06d}.png" for folder in (threaded, at_once))
+        assert first_file.read_bytes() == second_file.read_bytes()
 
 
 def test_a_frame_that_cannot_be_written_ends_the_take_and_leaves_whole_frames(trained, quiet):
@@ -214,14 +216,14 @@ def test_a_frame_that_cannot_be_written_ends_the_take_and_leaves_whole_frames(tr
             if (stage, done) == ("freezing", 0):
                 (folder / "preview" / "000105.png").mkdir()
 
-    asked = dict(take="refused", t_star=108, first=103, last=106, detail="off", develop="off")
+    options = dict(take="refused", t_star=108, first=103, last=106, detail="off", develop="off")
     with pytest.raises(OSError, match="000105"):
-        freeze_shot(world.shot, FreezeParams(**asked), InTheWay())
+        freeze_shot(world.shot, FreezeParams(**options), InTheWay())
     assert [p.name for p in sorted(folder.glob("*.exr"))] == ["000103.exr", "000104.exr"]
     assert read_frozen_exr(folder / "000104.exr").rgba.any() and not list(folder.rglob(".*"))
     (folder / "preview" / "000105.png").rmdir()
     before = (folder / "000104.exr").stat().st_mtime_ns
-    assert freeze_shot(world.shot, FreezeParams(**asked, only_missing=True), quiet())["frames"] == 4
+    assert freeze_shot(world.shot, FreezeParams(**options, only_missing=True), quiet())["frames"] == 4
     assert (folder / "000104.exr").stat().st_mtime_ns == before
 
 
@@ -262,32 +264,34 @@ def test_a_take_stays_until_the_one_that_replaces_it_is_done(trained, quiet):
     ask = dict(take="again", develop="off", first=103, last=108)
     freeze_shot(world.shot, FreezeParams(**ask, t_star=104), quiet())
     folder = world.shot.take("again")
-    beside = TakeFolder(folder).next.root
+    new_take = TakeFolder(folder).next.root
 
     def contents():
         return {
-            p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file() and beside not in p.parents
+            p.relative_to(folder): p.read_bytes()
+            for p in folder.rglob("*")
+            if p.is_file() and new_take not in p.parents
         }
 
     before = contents()
     with pytest.raises(Cancelled):
         freeze_shot(world.shot, FreezeParams(**ask, t_star=106), quiet(cancel_at=("freezing", 0.5)))
     assert contents() == before, "cancelled: the old take is whole"
-    begun = {p.name: p.stat().st_mtime_ns for p in beside.glob("*.exr")}
+    begun = {p.name: p.stat().st_mtime_ns for p in new_take.glob("*.exr")}
     assert 0 < len(begun) < 6
-    other = dict(ask, take="beside")
-    freeze_shot(world.shot, FreezeParams(**other, t_star=106), quiet())
+    second_request = dict(ask, take="beside")
+    freeze_shot(world.shot, FreezeParams(**second_request, t_star=106), quiet())
     (folder / "take.json").unlink()  # the state after a kill at the worst moment: some old frames, some new, one moved
     first = min(begun)
     for name in (f"preview/{first[:6]}.png", f"warp/{first}", first):
-        (beside / name).rename(folder / name)
+        (new_take / name).rename(folder / name)
     facts = freeze_shot(world.shot, FreezeParams(**ask, t_star=106, only_missing=True), quiet())
-    assert facts["t_star_frame"] == 106 and facts["frames"] == 6 and not beside.exists()
+    assert facts["t_star_frame"] == 106 and facts["frames"] == 6 and not new_take.exists()
     assert all((folder / name).stat().st_mtime_ns == at for name, at in begun.items()), "what was begun is used"
     for number in range(103, 109):
         names = (f"{number:06d}.exr", f"warp/{number:06d}.exr", f"preview/{number:06d}.png")
-        for made, wanted in ((folder / n, world.shot.take("beside") / n) for n in names):
-            assert made.read_bytes() == wanted.read_bytes()
+        for replaced, wanted in ((folder / n, world.shot.take("beside") / n) for n in names):
+            assert replaced.read_bytes() == wanted.read_bytes()
 
 
 def test_ramp_changes_the_instant_per_frame(trained, quiet):
@@ -300,7 +304,7 @@ def test_ramp_changes_the_instant_per_frame(trained, quiet):
         assert psnr(linear_to_srgb(image.rgba[..., :3]), world.image(n, n / 15).numpy()) > 20
 
 
-def test_camera_path_of_its_own_size(trained, quiet, tmp_path):
+def test_camera_path_can_set_the_frame_size(trained, quiet, tmp_path):
     world, _ = trained
     viewmat = world.viewmats[7].clone()
     viewmat[2, 3] = 0.3
@@ -319,10 +323,10 @@ def test_frames_that_the_footage_lacks_are_frozen_through_a_camera_between(train
     shot = Shot(tmp_path / "lost.splannequin")
     shutil.copytree(world.shot.root, shot.root, ignore=shutil.ignore_patterns("takes", "jobs"))
     for file in (shot.listing, shot.cameras):
-        told = json.loads(file.read_text())
-        told["frames"] = [row for row in told["frames"] if row["frame"] not in (107, 109)]
-        told["timecode"] = "01:00:00:22"
-        file.write_text(json.dumps(told))
+        event = json.loads(file.read_text())
+        event["frames"] = [row for row in event["frames"] if row["frame"] not in (107, 109)]
+        event["timecode"] = "01:00:00:22"
+        file.write_text(json.dumps(event))
         (shot.frames / "000107.png").unlink(missing_ok=True)
     checkpoint = shot.run("main") / "checkpoint.safetensors"
     tensors, meta = load_checkpoint(checkpoint)
@@ -356,7 +360,7 @@ def test_wrong_requests_are_sentences(trained, quiet, params, word):
         freeze_shot(world.shot, FreezeParams(take="wrong", **params), quiet())
 
 
-def test_t_star_snaps_to_a_trained_frame_and_says_so(trained, quiet):
+def test_t_star_snaps_to_a_trained_frame_with_a_note(trained, quiet):
     world, _ = trained
     report = quiet()
     facts = freeze_shot(world.shot, FreezeParams(take="snap", t_star=109, develop="off"), report)

@@ -62,7 +62,7 @@ def moves(trained_copy):
 
 
 @pytest.mark.parametrize("detail", ["on", "off"])
-def test_a_blurred_frame_is_the_mean_of_many(trained_copy, moves, tmp_path, quiet, detail):
+def test_blurred_frame_is_the_mean_of_its_samples(trained_copy, moves, tmp_path, quiet, detail):
     shot, ask = trained_copy.shot, dict(ASK, width=64, detail=detail, grain=True)
     path = save_path(tmp_path / "path.json", moves)
     facts = freeze_shot(shot, FreezeParams(take=f"blur {detail}", camera_path=path, shutter=180.0, **ask), quiet())
@@ -86,7 +86,7 @@ def test_a_blurred_frame_is_the_mean_of_many(trained_copy, moves, tmp_path, quie
         assert drawn > 1.5 * kept, "what the mean took from the plates' grain is drawn"
 
 
-def test_a_camera_that_stands_gives_the_frame_without_blur(trained_copy, moves, tmp_path, quiet):
+def test_static_camera_gives_no_blur(trained_copy, moves, tmp_path, quiet):
     shot, ask = trained_copy.shot, dict(ASK, width=64, grain=True)
     path = save_path(tmp_path / "path.json", [moves[1]] * 2)
     freeze_shot(shot, FreezeParams(take="stands", camera_path=path, shutter=360.0, **ask), quiet())
@@ -96,7 +96,7 @@ def test_a_camera_that_stands_gives_the_frame_without_blur(trained_copy, moves, 
             np.testing.assert_array_equal(getattr(blurred, name), getattr(sharp, name))
 
 
-def test_frames_whose_blur_changed_are_stale_and_no_others(trained_copy, moves, tmp_path, quiet):
+def test_only_frames_with_changed_blur_are_stale(trained_copy, moves, tmp_path, quiet):
     shot, ask = trained_copy.shot, dict(ASK, take="stale", width=32, detail="off")
     path, folder = str(tmp_path / "path.json"), shot.take("stale")
 
@@ -115,7 +115,7 @@ def test_frames_whose_blur_changed_are_stale_and_no_others(trained_copy, moves, 
     assert json.loads((folder / "take.json").read_text())["shutter"] == 90.0
 
 
-def test_on_the_clips_own_path_nothing_is_added_and_that_is_said(trained_copy, quiet):
+def test_clip_path_gets_no_motion_blur_and_reports_it(trained_copy, quiet):
     ask, report = dict(ASK, take="clip", first=104, last=104, detail="off"), quiet()
     shot = trained_copy.shot
     freeze_shot(shot, FreezeParams(**ask), quiet())
@@ -154,16 +154,16 @@ def test_a_blurs_length_is_its_geometry():
     assert min(places) > -0.4 - 0.2 and max(places) < -0.4 + 0.1, "within the shutter: 0.1 before, 0.2 after"
 
 
-def test_samples_are_bounded_and_one_frame_alone_stands():
+def test_blur_samples_are_bounded_and_a_single_frame_is_sharp():
     far = MotionBlur(cameras(shifted(0.0), shifted(-9.0)), 360.0)
     depth = torch.full((48, 64), 4.0)
     assert len(far.beside_middle(far.frames[0], far.frames[0].K, depth)) == far.config.most - 1
-    alone = MotionBlur(cameras(shifted(0.0)), 360.0)
-    assert alone.beside_middle(alone.frames[0], alone.frames[0].K, depth) == []
+    single = MotionBlur(cameras(shifted(0.0)), 360.0)
+    assert single.beside_middle(single.frames[0], single.frames[0].K, depth) == []
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7, 1.5])
-def test_the_grain_that_a_blur_leaves_is_that_of_noise_blurred_so(softness):
+def test_kept_grain_matches_blurred_noise(softness):
     """Fraction of the variance left in noise that is sampled linearly and averaged along a line."""
     rng = np.random.default_rng(4)
     x = np.arange(-12, 13)
@@ -173,6 +173,6 @@ def test_the_grain_that_a_blur_leaves_is_that_of_noise_blurred_so(softness):
     for length in (1.0, 4.0, 12.0):
         shifts = (np.arange(32) + 0.5) / 32 * length
         read = np.array([[np.interp(places + d, np.arange(400), line) for line in noise] for d in shifts])
-        found, told = read.mean(axis=0).var() / read.var(), float(kept_grain(torch.tensor(length), softness))
-        assert told == pytest.approx(found, abs=0.07)
+        found, expected = read.mean(axis=0).var() / read.var(), float(kept_grain(torch.tensor(length), softness))
+        assert expected == pytest.approx(found, abs=0.07)
     assert float(kept_grain(torch.tensor(0.0), softness)) == 1.0

@@ -17,7 +17,7 @@ ASK = dict(t_star=104, first=103, last=108, only_missing=True, deep=True)
 
 
 @pytest.fixture(scope="module")
-def own(trained_copy, quiet):
+def frozen_shot(trained_copy, quiet):
     """Copy of the trained shot with a take that was rendered at once."""
     shot = trained_copy.shot
     freeze_shot(shot, FreezeParams(take="whole", **ASK), quiet())
@@ -33,87 +33,87 @@ def part(shot, take, first, last, report):
     return freeze_part(shot, FreezeParams(**{**ASK, "take": take, "first": first, "last": last}), report)
 
 
-def test_frames_made_in_parts_are_those_made_at_once(own, quiet):
+def test_frames_rendered_in_parts_equal_a_single_render(frozen_shot, quiet):
     params = FreezeParams(take="parts", **ASK)
-    assert open_take(own, params, quiet()) == {"t_star": 104, "first": 103, "last": 108, "frames": 6}
-    assert part(own, "parts", 107, 109, quiet()) == {"frames": 3, "rendered": 3}
+    assert open_take(frozen_shot, params, quiet()) == {"t_star": 104, "first": 103, "last": 108, "frames": 6}
+    assert part(frozen_shot, "parts", 107, 109, quiet()) == {"frames": 3, "rendered": 3}
     with pytest.raises(JobError, match=r"lacks 4 of 6 frames, the first is 103"):
-        finish_take(own, params, quiet())
-    assert not (own.take("parts") / "take.json").exists()
-    assert part(own, "parts", 103, 105, quiet()) == {"frames": 3, "rendered": 3}
-    assert part(own, "parts", 106, 106, quiet()) == {"frames": 1, "rendered": 1}
-    assert part(own, "parts", 900, 910, quiet()) == {"frames": 0, "rendered": 0}
-    facts = finish_take(own, params, quiet())
+        finish_take(frozen_shot, params, quiet())
+    assert not (frozen_shot.take("parts") / "take.json").exists()
+    assert part(frozen_shot, "parts", 103, 105, quiet()) == {"frames": 3, "rendered": 3}
+    assert part(frozen_shot, "parts", 106, 106, quiet()) == {"frames": 1, "rendered": 1}
+    assert part(frozen_shot, "parts", 900, 910, quiet()) == {"frames": 0, "rendered": 0}
+    facts = finish_take(frozen_shot, params, quiet())
     assert (facts["first"], facts["last"], facts["frames"]) == (103, 109, 7)
-    at_once, apart = files(own.take("whole")), files(own.take("parts"))
+    at_once, in_parts = files(frozen_shot.take("whole")), files(frozen_shot.take("parts"))
     assert len(at_once) == 24
-    assert all(apart[name] == data for name, data in at_once.items())
+    assert all(in_parts[name] == data for name, data in at_once.items())
 
 
-def test_a_part_that_was_killed_is_made_again_and_the_rest_is_left_alone(own, quiet):
-    folder, params = own.take("killed"), FreezeParams(take="killed", **ASK)
-    open_take(own, params, quiet())
-    part(own, "killed", 103, 104, quiet())
+def test_killed_part_is_rerendered_and_others_kept(frozen_shot, quiet):
+    folder, params = frozen_shot.take("killed"), FreezeParams(take="killed", **ASK)
+    open_take(frozen_shot, params, quiet())
+    part(frozen_shot, "killed", 103, 104, quiet())
     before = (folder / "000103.exr").stat().st_mtime_ns
     (folder / "preview" / "000104.png").unlink()
     (folder / "000105.exr.tmp").write_bytes(b"half")
-    open_take(own, params, quiet())
-    assert part(own, "killed", 103, 105, quiet()) == {"frames": 3, "rendered": 2}
+    open_take(frozen_shot, params, quiet())
+    assert part(frozen_shot, "killed", 103, 105, quiet()) == {"frames": 3, "rendered": 2}
     assert (folder / "000103.exr").stat().st_mtime_ns == before
-    assert part(own, "killed", 103, 105, quiet()) == {"frames": 3, "rendered": 0}
+    assert part(frozen_shot, "killed", 103, 105, quiet()) == {"frames": 3, "rendered": 0}
 
 
-def test_an_instant_that_two_develop_at_once_is_the_first_ones(own, quiet, monkeypatch):
+def test_an_instant_that_two_develop_at_once_is_the_first_ones(frozen_shot, quiet, monkeypatch):
     from torch_backend.freeze.instant import instants as developed_instants
 
-    path = own.run("main") / "developed" / "000106.safetensors"
+    path = frozen_shot.run("main") / "developed" / "000106.safetensors"
     make, first = developed_instants._make, []
 
     def meanwhile(*words):
         if not first:
             first.append(True)
-            open_take(own, FreezeParams(take="other", **{**ASK, "t_star": 106}), quiet())
+            open_take(frozen_shot, FreezeParams(take="other", **{**ASK, "t_star": 106}), quiet())
             first.append(path.read_bytes())
         return make(*words)
 
     monkeypatch.setattr(developed_instants, "_make", meanwhile)
-    open_take(own, FreezeParams(take="late", **{**ASK, "t_star": 106}), quiet())
+    open_take(frozen_shot, FreezeParams(take="late", **{**ASK, "t_star": 106}), quiet())
     inode = path.stat().st_ino
     assert path.read_bytes() == first[1]
-    freeze_part(own, FreezeParams(take="late", **{**ASK, "t_star": 106, "last": 103}), quiet())
+    freeze_part(frozen_shot, FreezeParams(take="late", **{**ASK, "t_star": 106, "last": 103}), quiet())
     assert path.stat().st_ino == inode
 
 
-def test_parts_of_what_was_not_opened_or_of_another_run_are_refused(own, quiet):
+def test_parts_of_what_was_not_opened_or_of_another_run_are_refused(frozen_shot, quiet):
     with pytest.raises(JobError, match="was not opened"):
-        part(own, "unopened", 103, 103, quiet())
-    open_take(own, FreezeParams(take="parts2", **ASK), quiet())
-    state = own.take("parts2") / "state.json"
-    part(own, "parts2", 103, 103, quiet())
+        part(frozen_shot, "unopened", 103, 103, quiet())
+    open_take(frozen_shot, FreezeParams(take="parts2", **ASK), quiet())
+    state = frozen_shot.take("parts2") / "state.json"
+    part(frozen_shot, "parts2", 103, 103, quiet())
     write_json(state, {"version": 1, "key": "other", "t_star": 104, "frames": "other"})
     with pytest.raises(JobError, match="another run, other footage"):
-        part(own, "parts2", 104, 104, quiet())
-    open_take(own, FreezeParams(take="parts2", **ASK), quiet())
-    os.remove(own.run("main") / "developed" / "000104.safetensors")
+        part(frozen_shot, "parts2", 104, 104, quiet())
+    open_take(frozen_shot, FreezeParams(take="parts2", **ASK), quiet())
+    os.remove(frozen_shot.run("main") / "developed" / "000104.safetensors")
     with pytest.raises(JobError, match="is missing from the run"):
-        part(own, "parts2", 104, 104, quiet())
+        part(frozen_shot, "parts2", 104, 104, quiet())
 
 
-def test_frames_of_before_stay_until_the_take_is_finished(own, quiet):
+def test_frames_of_before_stay_until_the_take_is_finished(frozen_shot, quiet):
     params = FreezeParams(take="again", **{**ASK, "last": 104, "develop": "off"})
-    freeze_shot(own, params, quiet())
+    freeze_shot(frozen_shot, params, quiet())
     params.t_star = 110
-    open_take(own, params, quiet())
-    assert not (own.take("again") / "take.json").exists(), "it told of another instant"
-    assert (own.take("again") / "000104.exr").is_file()
+    open_take(frozen_shot, params, quiet())
+    assert not (frozen_shot.take("again") / "take.json").exists(), "it told of another instant"
+    assert (frozen_shot.take("again") / "000104.exr").is_file()
     params.last = 103
-    freeze_part(own, params, quiet())
+    freeze_part(frozen_shot, params, quiet())
     report = quiet()
-    finish_take(own, params, report)
+    finish_take(frozen_shot, params, report)
     (warning,) = [event[1] for event in report.events if event[0] == "warning" and "take again" in event[1]]
     assert warning.endswith("not rendered again: 1.")
-    assert sorted(p.name for p in own.take("again").glob("*.exr")) == ["000103.exr"]
-    assert not (own.take("again") / "preview" / "000104.png").exists()
+    assert sorted(p.name for p in frozen_shot.take("again").glob("*.exr")) == ["000103.exr"]
+    assert not (frozen_shot.take("again") / "preview" / "000104.png").exists()
 
 
 KILLED = """
@@ -143,48 +143,48 @@ freeze_part(shot, params, Quiet())
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
 @pytest.mark.parametrize("writes", [1, 2])
-def test_what_a_killed_part_of_another_instant_left_is_in_no_frame(own, quiet, writes):
+def test_what_a_killed_part_of_another_instant_left_is_in_no_frame(frozen_shot, quiet, writes):
     take = f"mixed{writes}"
     params = FreezeParams(take=take, **{**ASK, "last": 104, "develop": "off"})
-    freeze_shot(own, params, quiet())
-    before = files(own.take(take))
+    freeze_shot(frozen_shot, params, quiet())
+    before = files(frozen_shot.take(take))
     environ = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[4])}
-    command = [sys.executable, "-P", "-c", KILLED, str(own.root), take, str(writes)]
+    command = [sys.executable, "-P", "-c", KILLED, str(frozen_shot.root), take, str(writes)]
     assert subprocess.run(command, env=environ).returncode == -signal.SIGKILL
-    assert not (own.take(take) / "take.json").exists() and files(own.take(take)) != before
-    open_take(own, params, quiet())
-    freeze_part(own, params, quiet())
-    finish_take(own, params, quiet())
-    assert files(own.take(take)) == before
+    assert not (frozen_shot.take(take) / "take.json").exists() and files(frozen_shot.take(take)) != before
+    open_take(frozen_shot, params, quiet())
+    freeze_part(frozen_shot, params, quiet())
+    finish_take(frozen_shot, params, quiet())
+    assert files(frozen_shot.take(take)) == before
 
 
-def test_a_part_stops_when_its_take_is_opened_with_something_else(own, quiet):
+def test_a_part_stops_when_its_take_is_opened_with_something_else(frozen_shot, quiet):
     """A stalled host must not overwrite the new job's frames with old ones."""
     params = FreezeParams(take="straggler", **{**ASK, "last": 105, "develop": "off"})
-    open_take(own, params, quiet())
-    other = FreezeParams(take="straggler", **{**ASK, "last": 105, "t_star": 110, "develop": "off"})
+    open_take(frozen_shot, params, quiet())
+    second_params = FreezeParams(take="straggler", **{**ASK, "last": 105, "t_star": 110, "develop": "off"})
 
     class Meanwhile(type(quiet())):
         def check_cancelled(self):
             super().check_cancelled()
-            if (own.take("straggler") / "000103.exr").is_file() and not frames:
+            if (frozen_shot.take("straggler") / "000103.exr").is_file() and not frames:
                 frames.append(True)
-                open_take(own, other, quiet())
-                freeze_part(own, other, quiet())
+                open_take(frozen_shot, second_params, quiet())
+                freeze_part(frozen_shot, second_params, quiet())
 
     frames = []
     with pytest.raises(JobError, match="opened with other settings"):
-        freeze_part(own, params, Meanwhile())
-    facts = finish_take(own, other, quiet())
+        freeze_part(frozen_shot, params, Meanwhile())
+    facts = finish_take(frozen_shot, second_params, quiet())
     assert frames and facts["frames"] == 3
 
 
 @pytest.mark.parametrize("name", ["000103.exr", "warp/000103.exr", "preview/000103.png"])
-def test_a_frame_that_a_copy_cut_off_is_made_again(own, quiet, name):
+def test_truncated_frame_is_rendered_again(frozen_shot, quiet, name):
     params = FreezeParams(take="cut", **{**ASK, "last": 103})
-    freeze_shot(own, params, quiet())
-    file = own.take("cut") / name
+    freeze_shot(frozen_shot, params, quiet())
+    file = frozen_shot.take("cut") / name
     data = file.read_bytes()
     file.write_bytes(data[: len(data) * 3 // 4])
-    freeze_shot(own, params, quiet())
+    freeze_shot(frozen_shot, params, quiet())
     assert file.read_bytes() == data

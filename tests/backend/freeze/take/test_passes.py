@@ -51,7 +51,7 @@ def projected(points, output):
     return local[..., :2] / local[..., 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
 
 
-def made(output, depth, bands=1):
+def computed(output, depth, bands=1):
     """Complete layers, computed in `bands` bands."""
     layers = Passes(FRAMES, SCENE, TURNED).of(output, output.K, torch.from_numpy(depth))
     cuts = [n * H // bands for n in range(bands + 1)]
@@ -61,25 +61,25 @@ def made(output, depth, bands=1):
 @pytest.mark.parametrize("bands", [1, 4])
 def test_a_planes_passes_are_its_geometry(bands):
     depth, points = plane_depth(FRAMES[1])
-    found = made(FRAMES[1], depth, bands)
+    found = computed(FRAMES[1], depth, bands)
     np.testing.assert_allclose(found["Position"], TURNED.points(points / 0.5 + SCENE.centre), atol=1e-4)
     facing = np.broadcast_to(-(TURNED.rotation @ PLANE), (H, W, 3))
     np.testing.assert_allclose(found["Normal"], facing, atol=1e-4)
-    here, before, after = (projected(points, FRAMES[n]) for n in (1, 0, 2))
+    now, before, after = (projected(points, FRAMES[n]) for n in (1, 0, 2))
     up = np.array([1.0, -1.0])
     np.testing.assert_allclose(
-        found["Vector"], np.concatenate([(before - here) * up, (here - after) * up], -1), atol=1e-3
+        found["Vector"], np.concatenate([(before - now) * up, (now - after) * up], -1), atol=1e-3
     )
-    np.testing.assert_allclose(found["forward"], (after - here) * up, atol=1e-3)
-    np.testing.assert_allclose(found["backward"], (before - here) * up, atol=1e-3)
+    np.testing.assert_allclose(found["forward"], (after - now) * up, atol=1e-3)
+    np.testing.assert_allclose(found["backward"], (before - now) * up, atol=1e-3)
     assert np.abs(found["Vector"]).max() > 2.0, "or the test says nothing"
 
 
-def test_a_step_in_depth_tilts_no_normal_and_nothing_is_nowhere():
+def test_depth_step_does_not_tilt_normals_and_all_values_are_finite():
     depth, _ = plane_depth(FRAMES[1])
     depth[:, W // 2 :] *= 0.7  # a parallel, nearer plane, with the same normal
     depth[:5] = NO_DEPTH
-    found = made(FRAMES[1], depth)
+    found = computed(FRAMES[1], depth)
     facing = np.broadcast_to(-(TURNED.rotation @ PLANE), (H - 5, W, 3))
     np.testing.assert_allclose(found["Normal"][5:], facing, atol=1e-4)
     assert all(not layer[:5].any() for layer in found.values())
@@ -87,10 +87,10 @@ def test_a_step_in_depth_tilts_no_normal_and_nothing_is_nowhere():
 
 def test_at_the_ends_of_a_take_nothing_is_beyond():
     depth, _ = plane_depth(FRAMES[0])
-    first = made(FRAMES[0], depth)["Vector"]
+    first = computed(FRAMES[0], depth)["Vector"]
     assert not first[..., :2].any() and np.abs(first[..., 2]).min() > 0.1
     depth, _ = plane_depth(FRAMES[2])
-    last = made(FRAMES[2], depth)["Vector"]
+    last = computed(FRAMES[2], depth)["Vector"]
     assert np.abs(last[..., :2]).max() > 0.1 and not last[..., 2:].any()
 
 
@@ -99,10 +99,10 @@ def test_a_takes_passes_lie_on_its_cameras(trained, tmp_path, quiet):
     world, _ = trained
     placement = Placement([0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0])
     write_json(tmp_path / "placement.json", placement.to_json())
-    asked = FreezeParams(
+    params = FreezeParams(
         take="passes", t_star=105, first=104, last=106, passes=True, placement=str(tmp_path / "placement.json")
     )
-    facts = freeze_shot(world.shot, asked, quiet())
+    facts = freeze_shot(world.shot, params, quiet())
     assert facts["passes"]
     back = Similarity.of(placement).inverse()
     frames = {n: read_frozen_exr(world.shot.take("passes") / f"{n:06d}.exr") for n in (104, 105, 106)}
@@ -121,7 +121,7 @@ def test_a_takes_passes_lie_on_its_cameras(trained, tmp_path, quiet):
         np.testing.assert_allclose(lengths, 1.0, atol=2e-3)
         if n < 106:
             later = frames[n + 1].metadata
-            there = solve @ later.viewmat[:3, :3].T + later.viewmat[:3, 3]
-            goes = there[..., :2] / there[..., 2:] * np.diag(later.K)[:2] + later.K[:2, 2]
+            expected = solve @ later.viewmat[:3, :3].T + later.viewmat[:3, 3]
+            goes = expected[..., :2] / expected[..., 2:] * np.diag(later.K)[:2] + later.K[:2, 2]
             to = np.stack([x - frame.more["Vector"][..., 2], y + frame.more["Vector"][..., 3]], -1)
             np.testing.assert_allclose(to[is_solid], goes[is_solid], atol=2e-2)

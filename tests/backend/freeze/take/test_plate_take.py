@@ -36,9 +36,9 @@ RANGE = {"t_star": 105, "first": 103, "last": 108}
 def digest(path):
     """Digest of a picture's pixels and metadata without the time of writing."""
     image = oiio.ImageBuf(str(path))
-    told = image.spec().serialize("text", "detailed").splitlines()
-    told = [line for line in told if not line.strip().startswith(("DateTime", "oiio:SourcePath"))]
-    return hashlib.sha256(image.get_pixels(oiio.FLOAT).tobytes() + str(told).encode()).hexdigest()
+    lines = image.spec().serialize("text", "detailed").splitlines()
+    lines = [line for line in lines if not line.strip().startswith(("DateTime", "oiio:SourcePath"))]
+    return hashlib.sha256(image.get_pixels(oiio.FLOAT).tobytes() + str(lines).encode()).hexdigest()
 
 
 def files(folder):
@@ -91,7 +91,7 @@ def test_a_frame_is_its_warp_over_the_plate(trained, take):
     assert rows[2]["plate_share"] > 0.999, "frame 105 is its plate"  # one pixel of 3072 may come from another plate
 
 
-def test_without_detail_splats_alone_are_left(trained, take, quiet):
+def test_without_detail_only_splats_are_rendered(trained, take, quiet):
     world, _ = trained
     folder, _ = take
     whole = files(folder)
@@ -99,9 +99,9 @@ def test_without_detail_splats_alone_are_left(trained, take, quiet):
     bare = world.shot.take("bare")
     assert not (bare / "warp").exists() and "detail" not in facts and "warp_dir" not in facts
     for n in (103, 108):
-        plain, made = read_frozen_exr(bare / f"{n:06d}.exr"), read_frozen_exr(folder / f"{n:06d}.exr")
+        plain, detailed = read_frozen_exr(bare / f"{n:06d}.exr"), read_frozen_exr(folder / f"{n:06d}.exr")
         assert plain.detail is None
-        splat = np.asarray(made.detail.splat)[..., :3]
+        splat = np.asarray(detailed.detail.splat)[..., :3]
         np.testing.assert_allclose(splat, plain.rgba[..., :3], rtol=4e-3, atol=1e-4)
     freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, only_missing=True), quiet())
     assert files(bare) == whole, "asked for plates, none of the old frames is right"
@@ -109,7 +109,7 @@ def test_without_detail_splats_alone_are_left(trained, take, quiet):
     assert not list((bare / "warp").glob("*.exr")), "warps of frames that are gone are gone"
 
 
-def test_a_frame_alone_is_the_frame_among_others(trained, take, quiet):
+def test_single_frame_equals_the_same_frame_in_a_range(trained, take, quiet):
     world, _ = trained
     freeze_shot(world.shot, FreezeParams(take="one", **{**RANGE, "first": 107, "last": 107}), quiet())
     one, whole = files(world.shot.take("one")), files(take[0])
@@ -156,7 +156,7 @@ def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
     assert facts[0]["plate_share"] == pytest.approx(facts[1]["plate_share"], abs=2e-3)
 
 
-def test_a_frame_whose_warp_is_gone_is_made_again(trained, take, quiet):
+def test_frame_without_its_warp_is_rendered_again(trained, take, quiet):
     world, _ = trained
     ask = FreezeParams(take="torn", **{**RANGE, "last": 104}, only_missing=True)
     freeze_shot(world.shot, ask, quiet())
@@ -221,8 +221,8 @@ def bright(tmp_path_factory, world, quiet):
     for name in ("cameras.json", "points.npz"):
         shot.solve.mkdir(exist_ok=True)
         (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
-    told = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
-    (shot.solve / "solve.json").write_text(json.dumps(told))
+    record = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
+    (shot.solve / "solve.json").write_text(json.dumps(record))
     for n in range(101, 117):
         write_png(shot.frames / f"{n:06d}.png", read_png(shot.frames / "raw" / f"{n:06d}.png"))
         path = shot.root / PAINTED / f"{n:06d}.png"
@@ -304,22 +304,22 @@ def lit(tmp_path_factory, world, quiet):
     return shot
 
 
-def test_a_lamp_is_a_lamp_in_splats_alone(lit, quiet):
+def test_highlights_are_kept_in_splats_without_detail(lit, quiet):
     """Frames clipped at white could not exceed 1. Pixels away from the lamp are unchanged."""
     facts = freeze_shot(lit, FreezeParams(t_star=108, first=106, last=106, detail="off", develop="off"), quiet())
     frame = read_frozen_exr(lit.take("freeze") / "000106.exr")
     source = oiio.ImageBuf(str(lit.root.parent / "source" / "a.106.exr")).get_pixels(oiio.FLOAT)
     inside = binary_erosion(source[..., 1] > 10.0)
-    away = ~binary_dilation(source[..., 1] > 10.0, iterations=4)
-    assert inside.sum() > 20 and away.sum() > 1000
+    far = ~binary_dilation(source[..., 1] > 10.0, iterations=4)
+    assert inside.sum() > 20 and far.sum() > 1000
     assert np.median(frame.rgba[..., :3][inside]) == pytest.approx(LAMP, rel=0.3)
-    off = linear_to_srgb(frame.rgba[..., :3][away]) - linear_to_srgb(source[away])
-    assert np.abs(off).mean() < 0.03 and frame.rgba[..., :3][away].max() < 2.0
+    difference = linear_to_srgb(frame.rgba[..., :3][far]) - linear_to_srgb(source[far])
+    assert np.abs(difference).mean() < 0.03 and frame.rgba[..., :3][far].max() < 2.0
     assert frame.rgba.max() < 1.01 * LAMP
     assert np.abs(frame.grain[inside]).max() < 0.1, "grain is not what a lamp flickers by"
     preview = read_png(lit.take("freeze") / "preview" / "000106.png") / 255.0
     shown = ROLLED.from_light(frame.rgba[..., :3])
-    assert facts["grain"] is not None and np.abs(preview - shown)[away].max() < 1.5 / 255
+    assert facts["grain"] is not None and np.abs(preview - shown)[far].max() < 1.5 / 255
     assert 0.9 < np.median(preview[inside]) < 1.0
 
 

@@ -32,11 +32,11 @@ def test_a_range_with_a_step_then_the_rest_of_it(trained, quiet):
     assert sorted(more) == [102, 104, 105, 106, 108], "frames outside of the range stay"
     assert all(more[n] == some[n] for n in some), "and none of them is rendered again"
     assert (facts["first"], facts["last"], facts["frames"]) == (102, 108, 5)
-    same, other = quiet(), quiet()
+    same, second_report = quiet(), quiet()
     freeze_shot(world.shot, FreezeParams(**ask, first=104, last=104), same)
     assert times(folder) == more
-    freeze_shot(world.shot, FreezeParams(**{**ask, "t_star": 110}, first=104, last=105), other)
-    warned = [{event[1] for event in report.events if event[0] == "warning"} for report in (same, other)]
+    freeze_shot(world.shot, FreezeParams(**{**ask, "t_star": 110}, first=104, last=105), second_report)
+    warned = [{event[1] for event in report.events if event[0] == "warning"} for report in (same, second_report)]
     assert len(warned[1] - warned[0]) == 1, "it says that three frames go"
     assert sorted(times(folder)) == [104, 105], "at another instant none of the others is right"
 
@@ -92,7 +92,7 @@ def test_a_newer_run_makes_every_frame_stale(trained, quiet):
     assert all(before[n] != t for n, t in times(folder).items())
 
 
-def test_frames_of_an_earlier_version_are_made_anew_and_that_is_said_once(trained, quiet):
+def test_frames_of_an_older_version_are_rerendered_with_one_note(trained, quiet):
     """Their previews do not name the take that they belong to."""
     world, _ = trained
     folder = world.shot.take("old")
@@ -117,14 +117,14 @@ def test_a_frame_with_a_file_of_another_take_is_rendered_again(trained, quiet, k
     ask = dict(develop="off", first=101, last=102, only_missing=True)
     for take, t_star in (("here", 104), ("there", 110)):
         freeze_shot(world.shot, FreezeParams(take=take, t_star=t_star, **ask), quiet())
-    here, there = (next(world.shot.take(take).glob(f"{kind}/000102.*")) for take in ("here", "there"))
-    data = here.read_bytes()
-    assert data != there.read_bytes()
-    here.write_bytes(there.read_bytes())
+    kept, foreign = (next(world.shot.take(take).glob(f"{kind}/000102.*")) for take in ("here", "there"))
+    data = kept.read_bytes()
+    assert data != foreign.read_bytes()
+    kept.write_bytes(foreign.read_bytes())
     before = times(world.shot.take("here"))
     freeze_shot(world.shot, FreezeParams(take="here", t_star=104, **ask), quiet())
     after = times(world.shot.take("here"))
-    assert here.read_bytes() == data and before[101] == after[101] and before[102] != after[102]
+    assert kept.read_bytes() == data and before[101] == after[101] and before[102] != after[102]
 
 
 def test_a_copied_shot_has_the_frames_that_it_had(trained, quiet, tmp_path):
@@ -152,13 +152,13 @@ def test_a_damaged_frame_is_rendered_again(trained, quiet):
 
 
 @pytest.mark.parametrize("grain", [True, False])
-def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quiet, grain):
+def test_grain_layer_does_not_change_the_picture(trained, quiet, grain):
     world, _ = trained
     folder = world.shot.take(f"grain{grain}")
     part = dict(t_star=104, develop="off", first=101, last=102, detail="off")
     ask = FreezeParams(take=folder.name, grain=grain, **part)
     facts = freeze_shot(world.shot, ask, quiet())
-    one, other = (read_frozen_exr(folder / f"{n:06d}.exr") for n in (101, 102))
+    one, next_frame = (read_frozen_exr(folder / f"{n:06d}.exr") for n in (101, 102))
     plain = freeze_shot(world.shot, FreezeParams(take="plain", grain=False, **part), quiet())
     np.testing.assert_array_equal(one.rgba, read_frozen_exr(world.shot.take("plain") / "000101.exr").rgba)
     assert plain["grain"] is None
@@ -168,17 +168,17 @@ def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quie
         assert one.grain is None and facts["grain"] is None
         return
     assert len(facts["grain"]["deviation_8bit"]) == 3
-    assert one.grain.shape == one.rgba[..., :3].shape and other.grain.shape == one.grain.shape
+    assert one.grain.shape == one.rgba[..., :3].shape and next_frame.grain.shape == one.grain.shape
     if np.max(facts["grain"]["deviation_8bit"]) > 0:
-        assert one.grain.any() and not np.array_equal(one.grain, other.grain)
+        assert one.grain.any() and not np.array_equal(one.grain, next_frame.grain)
 
 
-def test_plates_bring_their_own_grain(trained, quiet):
+def test_plate_pixels_carry_plate_grain(trained, quiet):
     world, _ = trained
     ask = dict(t_star=104, develop="off", first=112, last=112)
     facts = freeze_shot(world.shot, FreezeParams(take="plates", **ask), quiet())
     plates = read_frozen_exr(world.shot.take("plates") / "000112.exr")
     assert np.max(facts["grain"]["deviation_8bit"]) > 0
     assert plates.detail.plate.min() < 0.9 and (plates.detail.plate == 1.0).mean() > 0.5
-    own = plates.grain[plates.detail.plate == 1.0]  # half-float rounding turns a matte of 0.9999 into 1
-    assert np.abs(own).max() < 1e-4 < np.abs(plates.grain).max()
+    plate_grain = plates.grain[plates.detail.plate == 1.0]  # half-float rounding turns a matte of 0.9999 into 1
+    assert np.abs(plate_grain).max() < 1e-4 < np.abs(plates.grain).max()

@@ -24,9 +24,9 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="on
 def opened(shot, take, report):
     """A take that is ready for rendering: (params, take, frames)."""
     params = FreezeParams(take=take, t_star=104, first=103, last=106)
-    made = planned(shot, params, report)
-    make_folders(made.folder, made.spec)
-    return params, made, in_range(made.whole, params)
+    plan = planned(shot, params, report)
+    make_folders(plan.folder, plan.spec)
+    return params, plan, in_range(plan.whole, params)
 
 
 def files(folder: TakeFolder):
@@ -49,30 +49,30 @@ def helpers():
 
 
 @pytest.fixture(scope="module")
-def own(trained_copy):
+def frozen_shot(trained_copy):
     return trained_copy.shot
 
 
 @pytest.fixture(scope="module")
-def alone(own, quiet):
+def one_process(frozen_shot, quiet):
     """(files, plate shares) of a take that one process rendered."""
-    _, take, frames = opened(own, "one-process", quiet())
+    _, take, frames = opened(frozen_shot, "one-process", quiet())
     shares = render_frames(take, frames, set(), quiet())
     return files(take.folder), shares
 
 
-def test_three_processes_write_the_same_bytes(own, quiet, alone):
+def test_three_processes_write_the_same_bytes(frozen_shot, quiet, one_process):
     """The next test and the test of a cancel use two processes."""
-    params, take, frames = opened(own, "three-processes", quiet())
-    shares = render_side_by_side(own, params, take, frames, {103}, quiet(), 3)
-    expected = {name: data for name, data in alone[0].items() if "000103" not in name}
+    params, take, frames = opened(frozen_shot, "three-processes", quiet())
+    shares = render_side_by_side(frozen_shot, params, take, frames, {103}, quiet(), 3)
+    expected = {name: data for name, data in one_process[0].items() if "000103" not in name}
     assert files(take.folder) == expected
-    assert sorted(shares) == [104, 105, 106] and all(shares[n].equal(alone[1][n]) for n in shares)
+    assert sorted(shares) == [104, 105, 106] and all(shares[n].equal(one_process[1][n]) for n in shares)
 
 
 @needs_proc
-def test_what_a_killed_process_leaves_is_rendered_by_its_starter(own, quiet, alone):
-    params, take, frames = opened(own, "one-killed", quiet())
+def test_what_a_killed_process_leaves_is_rendered_by_its_starter(frozen_shot, quiet, one_process):
+    params, take, frames = opened(frozen_shot, "one-killed", quiet())
 
     class Killer(type(quiet())):
         killed = 0
@@ -83,13 +83,13 @@ def test_what_a_killed_process_leaves_is_rendered_by_its_starter(own, quiet, alo
                 self.killed = found[0]
 
     report = Killer()
-    render_side_by_side(own, params, take, frames, set(), report, 2)
-    assert report.killed and files(take.folder) == alone[0] and not helpers()
+    render_side_by_side(frozen_shot, params, take, frames, set(), report, 2)
+    assert report.killed and files(take.folder) == one_process[0] and not helpers()
 
 
 @needs_proc
-def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(own, quiet, alone):
-    params, take, frames = opened(own, "all-cancelled", quiet())
+def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(frozen_shot, quiet, one_process):
+    params, take, frames = opened(frozen_shot, "all-cancelled", quiet())
 
     class Stop(type(quiet())):
         heard = 0
@@ -102,29 +102,29 @@ def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(own, quiet, alone):
                 raise Cancelled
 
     with pytest.raises(Cancelled):
-        render_side_by_side(own, params, take, frames, set(), Stop(), 2)
+        render_side_by_side(frozen_shot, params, take, frames, set(), Stop(), 2)
     assert not helpers()
     left = files(take.folder)
-    assert len(left) < len(alone[0]) and all(alone[0][name] == data for name, data in left.items())
-    render_side_by_side(own, params, take, frames, set(), quiet(), 2)
-    assert files(take.folder) == alone[0]
+    assert len(left) < len(one_process[0]) and all(one_process[0][name] == data for name, data in left.items())
+    render_side_by_side(frozen_shot, params, take, frames, set(), quiet(), 2)
+    assert files(take.folder) == one_process[0]
 
 
-def test_what_stops_one_of_them_is_told_as_if_there_were_one(own, quiet):
+def test_error_in_one_process_is_reported_like_a_single_process(frozen_shot, quiet):
     """An unreadable plate ends the take with the same message."""
-    params, take, frames = opened(own, "one-unreadable", quiet())
-    plate = own.plate(104)
+    params, take, frames = opened(frozen_shot, "one-unreadable", quiet())
+    plate = frozen_shot.plate(104)
     data = plate.read_bytes()
     plate.write_bytes(data[:100])
     try:
         with pytest.raises(JobError) as by_one:
             render_frames(take, frames, set(), quiet())
         with pytest.raises(JobError) as by_two:
-            render_side_by_side(own, params, take, frames, set(), quiet(), 2)
+            render_side_by_side(frozen_shot, params, take, frames, set(), quiet(), 2)
     finally:
         plate.write_bytes(data)
-    told = [(error.value.message, error.value.hint, error.value.exit_code) for error in (by_one, by_two)]
-    assert told[0] == told[1]
+    errors = [(error.value.message, error.value.hint, error.value.exit_code) for error in (by_one, by_two)]
+    assert errors[0] == errors[1]
 
 
 RENAMED = """
@@ -141,27 +141,27 @@ sys.exit(frame_process.main())
 """
 
 
-def test_nothing_is_written_under_the_former_name_of_a_shot_that_was_renamed(own, quiet):
-    params, take, _ = opened(own, "renamed", quiet())
-    moved = own.root.with_name("renamed.splannequin")
+def test_nothing_is_written_under_the_former_name_of_a_shot_that_was_renamed(frozen_shot, quiet):
+    params, take, _ = opened(frozen_shot, "renamed", quiet())
+    moved = frozen_shot.root.with_name("renamed.splannequin")
     request = {
-        "shot": str(own.root), "folder": str(take.folder.root), "t_star": take.t_star, "keys": take.all_keys,
+        "shot": str(frozen_shot.root), "folder": str(take.folder.root), "t_star": take.t_star, "keys": take.all_keys,
         "params": dataclasses.asdict(params), "frames": [103, 104],
     }  # fmt: skip
-    command = [sys.executable, "-c", RENAMED, str(own.root), str(moved)]
+    command = [sys.executable, "-c", RENAMED, str(frozen_shot.root), str(moved)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[4])
     try:
         write_message(process.stdin, request)
         said = [header["kind"] for header, _ in iter(lambda: read_message(process.stdout), None)]
         assert process.wait() != ExitCode.OK and said[-1] == "error"
-        assert moved.exists() and not own.root.exists()
+        assert moved.exists() and not frozen_shot.root.exists()
     finally:
         process.kill()
-        shutil.rmtree(own.root, ignore_errors=True)
-        moved.rename(own.root)
+        shutil.rmtree(frozen_shot.root, ignore_errors=True)
+        moved.rename(frozen_shot.root)
 
 
-def test_as_many_as_cores_frames_and_memory_allow():
+def test_process_count_is_limited_by_cores_frames_and_memory():
     assert processes_for(300, 640 * 480, 16, 64e9) == 8
     assert processes_for(300, 640 * 480, 1, 64e9) == 1
     assert processes_for(30, 640 * 480, 16, 64e9) == 2
@@ -169,6 +169,6 @@ def test_as_many_as_cores_frames_and_memory_allow():
     assert processes_for(300, 640 * 480, 16, 0.0) == 1
 
 
-def test_threads_are_as_many_as_torch_is_told(monkeypatch):
+def test_thread_count_follows_torch(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     assert default_threads() == 1

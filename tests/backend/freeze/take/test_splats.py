@@ -99,8 +99,8 @@ def test_both_files_hold_the_same_splats_and_the_take_says_where(taken):
     np.testing.assert_array_equal(usd.means, ply.means)
     np.testing.assert_array_equal(usd.sh, ply.sh)
     np.testing.assert_allclose(usd.log_scales, ply.log_scales, atol=1e-5)
-    told = json.loads((shot.take("placed") / "take.json").read_text())["placement"]
-    assert (told["scene_from_solve"], told["metres_per_unit"]) == (TURNED, 0.01)
+    placement = json.loads((shot.take("placed") / "take.json").read_text())["placement"]
+    assert (placement["scene_from_solve"], placement["metres_per_unit"]) == (TURNED, 0.01)
     stage = Usd.Stage.Open(facts["usd"])
     assert UsdGeom.GetStageMetersPerUnit(stage) == 0.01 and stage.GetEndTimeCode() == 116
 

@@ -34,16 +34,16 @@ def test_a_take_of_plates_is_good():
 
 
 def test_the_worst_frame_is_named_where_no_place_is():
-    told = facts()
-    told["detail"]["per_frame"][36]["plate_share"] = 0.86
-    verdict = judge_take(told)
+    all_facts = facts()
+    all_facts["detail"]["per_frame"][36]["plate_share"] = 0.86
+    verdict = judge_take(all_facts)
     assert verdict is not None and verdict.word == "good"
     assert verdict.lines()[1:] == ["Most of it in frame 37: 14 %."]
-    told["detail"]["per_frame"][36]["plate_share"] = 0.91
-    assert judge_take(told).lines()[1:] == []
+    all_facts["detail"]["per_frame"][36]["plate_share"] = 0.91
+    assert judge_take(all_facts).lines()[1:] == []
 
 
-def test_a_guess_at_the_end_is_told_with_frames_place_and_what_to_do():
+def test_guessed_area_is_reported_with_frames_place_and_advice():
     verdict = judge_take(facts(lost=range(31, 41)))
     assert verdict is not None and verdict.word == "fair"
     assert verdict.lines()[1:] == [
@@ -57,8 +57,10 @@ def test_a_guess_at_the_end_is_told_with_frames_place_and_what_to_do():
     assert advised is not None and "Try a t* nearer to frame 28." in advised.advice, "within what the run recommends"
     keyed = judge_take(facts(lost=range(31, 41), t_star_per_frame={"1": 8.0}))
     assert keyed is not None and keyed.advice == ["Or deliver only frames 1 to 30."]
-    own = judge_take(facts(lost=range(31, 41), camera_path="a.json"))
-    assert own is not None and own.advice == ["Keep the camera closer to the clip's own path there."]
+    of_artists_camera = judge_take(facts(lost=range(31, 41), camera_path="a.json"))
+    assert of_artists_camera is not None and of_artists_camera.advice == [
+        "Keep the camera closer to the clip's own path there."
+    ]
 
 
 def test_a_place_that_is_a_guess_all_along_may_be_one_that_does_not_move():
@@ -72,9 +74,9 @@ def test_a_take_that_is_mostly_guessed_is_poor():
     assert verdict is not None and verdict.word == "poor" and verdict.advice
 
 
-def test_a_take_of_splats_alone_says_so_and_one_of_before_says_nothing():
-    alone = judge_take({**facts(), "detail": None})
-    assert alone is not None and "Detail is off" in alone.sentences[0]
+def test_take_of_splats_only_is_reported_and_older_takes_are_not():
+    splats_only = judge_take({**facts(), "detail": None})
+    assert splats_only is not None and "Detail is off" in splats_only.sentences[0]
     assert judge_take({"t_star_frame": 8}) is None
 
 
@@ -103,9 +105,9 @@ def results() -> dict:
 
 
 def test_the_summary_of_a_whole_run_has_verdict_and_shares():
-    told = results()
-    told["freeze"] |= facts() | {"verdict": vars(judge_take(facts()))}
-    summary = json.loads(json.dumps(summarise("s", "c", told, {}, 1.0)))
+    results_of_run = results()
+    results_of_run["freeze"] |= facts() | {"verdict": vars(judge_take(facts()))}
+    summary = json.loads(json.dumps(summarise("s", "c", results_of_run, {}, 1.0)))
     assert summary["verdict"] == ["Fair. A.", "B.", "Good. 98 % of the picture is plate, 2 % is a guess."]
     assert summary["plate_share"] == pytest.approx(0.98) and summary["invented_share"] == pytest.approx(0.02)
     old = summarise("s", "c", results(), {}, 1.0)

@@ -73,7 +73,7 @@ def test_odd_sizes_repeat_the_edge(tmp_path):
     assert np.abs(read[33, :28] - 90).max() < 8
 
 
-def test_index_stands_before_the_pictures(tmp_path):
+def test_video_index_precedes_the_pictures(tmp_path):
     path = tmp_path / "video.mp4"
     write_video(path, moving_picture(5, 64, 64), 25)
     data = path.read_bytes()
@@ -118,7 +118,7 @@ def test_refuses_bad_frames_and_leaves_nothing(tmp_path, frames, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_error_while_frames_are_made_keeps_the_old_video(tmp_path):
+def test_render_error_keeps_the_old_video(tmp_path):
     def broken():
         yield from moving_picture(3, 64, 64)
         raise RuntimeError("render failed")
@@ -132,7 +132,7 @@ def test_an_error_while_frames_are_made_keeps_the_old_video(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["video.mp4"]
 
 
-def test_without_h264_it_says_so_and_still_writes(tmp_path, monkeypatch):
+def test_missing_h264_is_reported_and_a_video_is_written(tmp_path, monkeypatch):
     """Some builds of PyAV lack x264."""
     monkeypatch.setattr(av, "codecs_available", {"mpeg4"})
     stored = list(moving_picture(4, 120, 160))

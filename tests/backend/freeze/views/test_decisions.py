@@ -34,7 +34,7 @@ def frame(trained):
     size, i = (plates.width, plates.height), scene.frames.index(pose)
     output = OutputFrame(pose, scene.viewmats[i], scene.camera_at(*size)[i], float(t_star), float(pose))
 
-    def made(by=0.0):
+    def make(by=0.0):
         frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run))
         noise = torch.Generator().manual_seed(3)
         for name, value in frozen.state.items():
@@ -44,7 +44,7 @@ def frame(trained):
         out = compositor.frame(output, frozen, image, *size)
         return torch.cat([out.linear, out.support[..., None], out.motion[..., None]], dim=-1)
 
-    return made
+    return make
 
 
 def test_rounding_errors_of_the_scene_stay_rounding_errors(frame):

@@ -64,11 +64,11 @@ def single(*values):
 def test_it_is_what_float64_says(plate, with_ignored):
     points, viewmat, K, surface, ignored = plate
     ignored = ignored if with_ignored else np.zeros_like(ignored)
-    given = single(points, viewmat, K, surface, ignored)
-    given = given if with_ignored else [*given[:-1], None]
+    inputs = single(points, viewmat, K, surface, ignored)
+    inputs = inputs if with_ignored else [*inputs[:-1], None]
     # Inputs are rounded to float32 first, so that only the arithmetic is tested.
     rounded = [np.asarray(v, np.float32).astype(float) for v in (points, viewmat, K, surface, ignored)]
-    found, expected = visible_pixels(*given, TOLERANCE, SOFT), reference(*rounded)
+    found, expected = visible_pixels(*inputs, TOLERANCE, SOFT), reference(*rounded)
     clear = np.abs(expected[1]) > 1e-3  # near the camera's plane, rounding decides which points are in front
     assert (expected[2] > 0.5).sum() > 100 and (expected[1] < 0).sum() > 500
     for name, mine, theirs in zip(("depth", "moving", "explained"), (found.depth, found.moving, found.explained),
@@ -80,7 +80,7 @@ def test_it_is_what_float64_says(plate, with_ignored):
     assert (found.pixels.numpy()[expected[1] < -1e-3] == -1e6).all()
 
 
-def test_one_thread_or_many_and_any_shape_are_the_same(plate):
+def test_result_is_independent_of_threads_and_shape(plate):
     points, *camera = single(*plate)
     whole = visible_pixels(points, *camera, TOLERANCE, SOFT)
     for part in (slice(0, 1), slice(5, 22), slice(8000, 10007)):
@@ -92,7 +92,7 @@ def test_one_thread_or_many_and_any_shape_are_the_same(plate):
     assert visible_pixels(points[:0], *camera, TOLERANCE, SOFT).depth.shape == (0,)
 
 
-def test_what_is_no_number_is_seen_nowhere_and_reads_nothing_beyond_the_picture(plate):
+def test_non_finite_points_are_invisible_and_read_in_bounds(plate):
     _, *camera = single(*plate)
     odd = torch.tensor([[math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0], [0.0, -math.inf, 1.0], [1e30, 1e30, 1e30]])
     found = visible_pixels(odd, *camera, TOLERANCE, SOFT)
@@ -100,7 +100,7 @@ def test_what_is_no_number_is_seen_nowhere_and_reads_nothing_beyond_the_picture(
     assert bool(found.moving.isfinite().all()) and bool(found.explained.isfinite().all())
 
 
-def test_other_numbers_than_float32_are_refused(plate):
+def test_inputs_other_than_float32_are_refused(plate):
     points, *camera = single(*plate)
     with pytest.raises(ValueError, match="float32"):
         visible_pixels(points.double(), *camera, TOLERANCE, SOFT)
