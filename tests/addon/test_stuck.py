@@ -120,7 +120,7 @@ def test_the_panel_says_how_the_footage_was_read(addon, with_shot):
     shot = addon("shot.selection").shot_folder(with_shot)
     listing = shot / "frames" / "frames.json"
     told = json.loads(listing.read_text())
-    told["read_as"] = ["Read as 64 x 48, 24 fps.", 7, "Assumed, for the footage does not say: matrix."]
+    told["read_as"] = ["Read as 64 x 48, 24 fps.", 7, "Assumed, because the footage does not state it: matrix."]
     listing.write_text(json.dumps(told))
     view = addon("process.steps").STEPS["import"].view(with_shot, addon("shot.inventory").read(shot))
     assert view.state[-2:] == [told["read_as"][0], told["read_as"][2]]

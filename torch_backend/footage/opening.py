@@ -51,9 +51,12 @@ def open_source(
         )
     video = open_video(path, colours, told, layer)
     layer = "" if video.has_streams else layer
-    for value, what, own in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
+    for value, what, own in (
+        (fps, "rate", f"its own, {video.info.fps:g} frames per second"),
+        (layer, "layer", "only one"),
+    ):
         if value:
-            video.warnings.append((f"The {what} {value!r} is ignored: a video has its own, {own}.", ""))
+            video.warnings.append((f"The {what} {value!r} is ignored: a video has {own}.", ""))
     return video
 
 

@@ -348,7 +348,7 @@ def test_which_of_two_streams_is_read_is_said_and_the_other_can_be_named(two_str
     source, got = decoded(path)
     assert source.warnings == [
         (
-            "The clip has 2 video streams: number 1 is taken, 64x48.",
+            "The clip has 2 video streams: number 1 is used, 64x48.",
             "Choose another by its number (--layer): 1 (64x48), 2 (64x48).",
         )
     ]

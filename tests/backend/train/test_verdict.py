@@ -61,7 +61,7 @@ def test_a_walker_is_told_with_frames_place_and_what_to_do():
         {"first": 10, "last": 31, "region": "lower left"}, {"first": 10, "last": 40, "region": "middle"}
     ]  # fmt: skip
     assert verdict.sentences == [
-        "It does not hold in frames 10 to 31, lower left.",
+        "It does not match the clip in frames 10 to 31, lower left.",
         "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 40, middle.",
     ]
     assert verdict.advice == ["Choose t* in frames 43 to 73, or train only on that range."]
@@ -168,4 +168,4 @@ def test_somebody_who_walks_through_is_told(tmp_path, quiet, holdout):
     number = re.search(rf"([\d.]+) dB on half of its {summary['quality_on']}", told[1])
     assert number and float(number[1]) == pytest.approx(summary["median_psnr_db"], abs=0.056)
     assert "walks through" in told[2] and "solve" in told[2]
-    assert "It does not hold in frame" in told[2], "frames and place are told"
+    assert "It does not match the clip in frame" in told[2], "frames and place are told"
