@@ -169,7 +169,7 @@ def test_freeze_of_a_shot_asks_for_the_freeze_alone_and_of_a_clip_for_everything
         (
             ("--preset=preview", "--iter", "5", "--camera-model", "OPENCV"),
             "--preset, --iterations and --camera-model are for a clip",
-            "Leave them out, or say them to `solve` and `train`.",
+            "Leave them out, or pass them to `solve` and `train`.",
         ),
         (("--output", "output"), "--output is for a clip", "Leave it out."),
         (("--restart",), "--restart is for a clip", "Leave it out, or pass it to `train`."),
