@@ -147,7 +147,7 @@ def test_a_sequences_rate_and_layer_come_from_the_command_line(tmp_path):
     shot = tmp_path / "a.splannequin"
     unsure = run("import", shot, tmp_path / "a.000.exr")
     assert unsure.returncode == ExitCode.FOOTAGE
-    assert "none is named as the picture itself: left, right. Choose one by its name (--layer)" in unsure.stdout
+    assert "none is recognised as the picture itself: left, right. Choose one by its name (--layer)" in unsure.stdout
     done = run("import", shot, tmp_path / "a.000.exr", "--layer", "right", "--fps", 12, "--step", 1)
     assert done.returncode == ExitCode.OK, done.stdout + done.stderr
     info = json.loads((shot / "shot.json").read_text())

@@ -94,7 +94,11 @@ def test_only_instants_that_the_runs_verdict_recommends_are_suggested(trained, q
     world, _ = trained
     record = world.shot.run("main") / "summary.json"
     before = json.loads(record.read_text())
-    advised = {"word": "fair", "sentences": ["It does not hold in frames 101 to 109, left."], "instants": [110, 114]}
+    advised = {
+        "word": "fair",
+        "sentences": ["It does not match the clip in frames 101 to 109, left."],
+        "instants": [110, 114],
+    }
     write_json(record, {**before, "verdict": advised})
     try:
         session = LiveSession(world.shot, "main", "cpu")

@@ -78,7 +78,7 @@ SMALL = ("--iterations", "20", "--max-gaussians", "200")
         ("take {}/s --camera-path {}/gone.json", "gone.json does not exist"),
         ("take {}/s --camera-path {}/deep.json", "deep.json is not valid JSON"),
         ("take {}/s --camera-path {}/list.json", "should hold a JSON object"),
-        ("take {}/s --camera-path {}/odd.json", "odd.json holds no camera path"),
+        ("take {}/s --camera-path {}/odd.json", "odd.json is not a camera path"),
         ("take {}/s --camera-path {}", "is not a file"),
         (f"take {{}}/s --t-star {HUGE}", "t*"),
         ("import {}/s clip.mp4 --camera-model OPENCV", "unrecognized arguments: --camera-model"),

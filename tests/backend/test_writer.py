@@ -277,7 +277,7 @@ def test_an_import_into_a_shot_that_goes_leaves_nothing_in_its_place(shot, tmp_p
     folder = job.new_job(shot, "import", contract.ImportParams(source=str(CLIP), first=1, last=8))
     heard = []
     assert job.run_job(folder, heard.append) == (ExitCode.USAGE, None)
-    assert heard[-2].data["message"].startswith("The import ended: the shot folder") and not shot.root.exists()
+    assert heard[-2].data["message"].startswith("The import stopped: the shot folder") and not shot.root.exists()
 
 
 def test_locked_shot_creates_folders_only_inside_it(tmp_path):

@@ -289,7 +289,7 @@ def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", f"file://{tmp_path}{index}")
     disk = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 - 1e8)))
-    with pytest.raises(LauncherError, match=f"needs {needed} GB and .* has {needed - 0.1:.1f} GB free") as refused:
+    with pytest.raises(LauncherError, match=f"needs {needed} GB, but .* has {needed - 0.1:.1f} GB free") as refused:
         set_up(backend, sys.executable)
     assert refused.value.exit_code == 8
     assert not backend.folder.exists()

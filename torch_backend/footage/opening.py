@@ -51,9 +51,12 @@ def open_source(
         )
     video = open_video(path, colours, overrides, layer)
     layer = "" if video.has_streams else layer
-    for value, what, kept in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
+    for value, what, kept in (
+        (fps, "rate", f"its own, {video.info.fps:g} frames per second"),
+        (layer, "layer", "only one"),
+    ):
         if value:
-            video.warnings.append((f"The {what} {value!r} is ignored: a video has its own, {kept}.", ""))
+            video.warnings.append((f"The {what} {value!r} is ignored: a video has {kept}.", ""))
     return video
 
 

@@ -101,7 +101,9 @@ def read_ply(path: str | Path) -> PlyGaussians:
         count, layout = vertex_layout(handle, path)
         need, available = count * layout.itemsize, os.fstat(handle.fileno()).st_size - handle.tell()
         if available < need:
-            raise ValueError(f"{path}: cut short, {count} Gaussians need {need} bytes and {available} are there")
+            raise ValueError(
+                f"{path}: cut short, {count} Gaussians need {need} bytes, but only {available} are present"
+            )
         rows = np.fromfile(handle, dtype=layout, count=count)
     fields = rows.dtype.names or ()
     higher = sum(name.startswith("f_rest_") for name in fields)

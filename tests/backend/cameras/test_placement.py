@@ -106,7 +106,7 @@ def test_a_placement_is_that_of_the_present_solve(tmp_path, path):
     with pytest.raises(ValueError, match="belongs to another solve"):
         placement_for(shot, str(shot.placement))
     named.write_text(json.dumps({"scene_from_solve": [1.0]}))
-    with pytest.raises(ValueError, match=r"other\.json holds no placement"):
+    with pytest.raises(ValueError, match=r"other\.json is not a placement"):
         placement_for(shot, str(named))
 
 

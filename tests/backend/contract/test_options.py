@@ -165,14 +165,14 @@ def test_freeze_of_a_shot_requests_one_step_and_of_a_clip_all(tmp_path):
 @pytest.mark.parametrize(
     ("words", "named", "instead"),
     [
-        (("--fps", "24"), "--fps is for a clip", "Leave it out, or say it to `import`."),
+        (("--fps", "24"), "--fps is for a clip", "Leave it out, or pass it to `import`."),
         (
             ("--preset=preview", "--iter", "5", "--camera-model", "OPENCV"),
             "--preset, --iterations and --camera-model are for a clip",
-            "Leave them out, or say them to `solve` and `train`.",
+            "Leave them out, or pass them to `solve` and `train`.",
         ),
         (("--output", "output"), "--output is for a clip", "Leave it out."),
-        (("--restart",), "--restart is for a clip", "Leave it out, or say it to `train`."),
+        (("--restart",), "--restart is for a clip", "Leave it out, or pass it to `train`."),
     ],
 )
 def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, instead, capsys):
@@ -187,10 +187,13 @@ def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, in
     ("words", "note"),
     [
         (("take", "s.splannequin"), "`take SHOT` is now called `freeze SHOT`"),
-        (("train", "s.splannequin", "--host", "mlp", "--method", "static"), "--host is passed over"),
-        (("train", "s.splannequin", "--detector", "weight"), "only with --supervision paper"),
-        (("train", "s.splannequin", "--extend", "9", "--preset", "final", "--run", "a"), "--preset: passed over"),
-        (("export", "s.splannequin", "--output", "o", "--format", "nerfstudio", "--text"), "--text is passed over"),
+        (("train", "s.splannequin", "--host", "mlp", "--method", "static"), "--host is ignored"),
+        (("train", "s.splannequin", "--detector", "weight"), "only works with --supervision paper"),
+        (
+            ("train", "s.splannequin", "--extend", "9", "--preset", "final", "--run", "a"),
+            "--preset: ignored with --extend",
+        ),
+        (("export", "s.splannequin", "--output", "o", "--format", "nerfstudio", "--text"), "--text is ignored"),
     ],
 )
 def test_ignored_and_outdated_options_print_a_note(words, note, capsys):

@@ -156,7 +156,7 @@ def test_a_camera_path_goes_into_the_shot(shot, requests, tmp_path):
 
 @pytest.mark.parametrize(
     ("instants", "table", "said"),
-    [([21], {}, "t\\* is frame 21: hall has frames 1 to 20"), ([], {"hal": [3]}, "names hal, which is none")],
+    [([21], {}, "t\\* is frame 21: hall has frames 1 to 20"), ([], {"hal": [3]}, "names hal, which is not one")],
 )
 def test_instants_that_cannot_be_are_said_before_any_work(shot, requests, instants, table, said):
     with pytest.raises(JobError, match=said):
@@ -188,7 +188,7 @@ def test_file_parameters_override_options(tmp_path, requests):
     write_json(file, {"freeze": {"width": 320, "t_star_per_frame": {"3": 4.0}}, "train": {"preset": "final"}})
     read = read_requests(str(file), requests(take="hero"))
     assert (read["freeze"].width, read["freeze"].take, read["train"].preset) == (320, "hero", "final")
-    wrongs = ({"bake": {}}, "'bake' is none of"), ({"freeze": {"wide": 3}}, "wide"), ({"train": {"preset": "x"}}, "'x'")
+    wrongs = ({"bake": {}}, "'bake' is not one of"), ({"freeze": {"wide": 3}}, "wide"), ({"train": {"preset": "x"}}, "'x'")
     for wrong, said in wrongs:
         write_json(file, wrong)
         with pytest.raises(JobError, match=said):

@@ -273,7 +273,7 @@ def test_ignored_rate_or_layer_of_a_video_is_reported(shot, clip, recorder):
     assert import_footage(shot, clip, FootageConfig(fps=50.0, layer="rgba"), report)["fps"] == 10.0
     assert report.warnings == [
         "The rate 50.0 is ignored: a video has its own, 10 frames per second.",
-        "The layer 'rgba' is passed over: a video has its own, a single one.",
+        "The layer 'rgba' is ignored: a video has only one.",
     ]
 
 
@@ -303,21 +303,21 @@ def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, 
         == load_frames(shot)["read_as"]
         == [
             "Read as 64 x 48, square pixels, 10 fps, 8 bits, video, Rec.709, matrix BT.601, video levels, no alpha.",
-            "Assumed, for the footage does not say: pixel aspect, colour space, matrix, levels.",
+            "Assumed, because the footage does not state it: pixel aspect, colour space, matrix, levels.",
         ]
     )
     chosen = FootageConfig(step=1, matrix="bt709", levels="full", pixel_aspect=2.0)
     assert import_footage(shot, clip, chosen, recorder())["read_as"] == [
         "Read as 128 x 48, pixels 2 times as wide, 10 fps, 8 bits, video, Rec.709, matrix BT.709, full levels, "
         "no alpha.",
-        "Assumed, for the footage does not say: colour space.",
+        "Assumed, because the footage does not state it: colour space.",
     ]
     report = recorder()
     reading = import_footage(shot, str(sequence(1)), chosen, report)["read_as"]
     assert reading == [
         "Read as 128 x 48, pixels 2 times as wide, 24 fps, 8 bits, sRGB, Rec.709, no alpha.",
         "Frames 1 to 12 are read from shot.####.png.",
-        "Assumed, for the footage does not say: rate.",
+        "Assumed, because the footage does not state it: rate.",
     ]
     assert "The matrix 'bt709' is ignored: pictures already store RGB." in report.warnings
 

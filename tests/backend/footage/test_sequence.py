@@ -347,7 +347,7 @@ def test_the_picture_itself_is_found_among_layers_and_named(tmp_path, names, tak
         write(tmp_path / f"a.{i}.exr", flat(*values), names=names)
     source, pixel = first_of(tmp_path)
     assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
-    assert said(source) == [f"The pictures have 3 layers: {taken} is taken."]
+    assert said(source) == [f"The pictures have 3 layers: {taken} is used."]
     assert source.info.reading["layer"] == ("" if taken.startswith("RGB") else taken)
 
 
@@ -357,14 +357,14 @@ def test_a_part_with_depth_before_the_picture_is_not_taken_for_it(tmp_path):
         write_parts(tmp_path / f"a.{i}.exr", parts)
     source, pixel = first_of(tmp_path)
     assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
-    assert said(source) == ["The pictures have 2 layers: beauty is taken."]
+    assert said(source) == ["The pictures have 2 layers: beauty is used."]
 
 
 def test_layers_of_which_none_is_surely_the_picture_are_listed_and_can_be_chosen(tmp_path):
     names = ("left.R", "left.G", "left.B", "right.R", "right.G", "right.B")
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", flat(0.9, 0.9, 0.9, 0.3, 0.2, 0.1), names=names)
-    with pytest.raises(JobError, match=r"none is named as the picture itself: left, right\.") as error:
+    with pytest.raises(JobError, match=r"none is recognised as the picture itself: left, right\.") as error:
         open_source(str(tmp_path))
     assert error.value.exit_code == ExitCode.FOOTAGE and "--layer" in error.value.hint
     source, pixel = first_of(tmp_path, layer="Right")

@@ -348,7 +348,7 @@ def test_chosen_video_stream_is_reported_and_selectable(two_streams):
     source, got = decoded(path)
     assert source.warnings == [
         (
-            "The clip has 2 video streams: number 1 is taken, 64x48.",
+            "The clip has 2 video streams: number 1 is used, 64x48.",
             "Choose another by its number (--layer): 1 (64x48), 2 (64x48).",
         )
     ]

@@ -152,7 +152,7 @@ def test_layers(tmp_path):
     one = written(tmp_path, st, names=("lens.R", "lens.G"), name="one.exr")
     assert error_px(read(one)[0], 0.2) < 1e-3, "the only pair there is"
     two = written(tmp_path, st, names=("a.back.R", "a.back.G", "b.x", "b.y"), name="two.exr")
-    with pytest.raises(JobError, match=r"several layers that may be meant: a\.back, b") as refused:
+    with pytest.raises(JobError, match=r"several layers that could be the map: a\.back, b") as refused:
         read(two)
     assert "--st-map-layer" in refused.value.hint
     assert error_px(read(two, layer="Back")[0], 0.2) < 1e-3

@@ -61,7 +61,7 @@ def test_walker_is_reported_with_frames_place_and_advice():
         {"first": 10, "last": 31, "region": "lower left"}, {"first": 10, "last": 40, "region": "middle"}
     ]  # fmt: skip
     assert verdict.sentences == [
-        "It does not hold in frames 10 to 31, lower left.",
+        "It does not match the clip in frames 10 to 31, lower left.",
         "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 40, middle.",
     ]
     assert verdict.advice == ["Choose t* in frames 43 to 73, or train only on that range."]
@@ -170,4 +170,4 @@ def test_person_walking_through_is_reported(tmp_path, quiet, holdout):
     number = re.search(rf"([\d.]+) dB on half of its {summary['quality_on']}", warning[1])
     assert number and float(number[1]) == pytest.approx(summary["median_psnr_db"], abs=0.056)
     assert "walks through" in warning[2] and "solve" in warning[2]
-    assert "It does not hold in frame" in warning[2], "frames and place are told"
+    assert "It does not match the clip in frame" in warning[2], "frames and place are told"

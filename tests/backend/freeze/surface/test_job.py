@@ -113,6 +113,6 @@ def test_foreign_surface_file_is_rejected(take, quiet):
     for wrong in (b"", b"ply\n", whole + b"x", whole.replace(b"element face ", b"element face 9", 1)):
         folder.surface.write_bytes(wrong)
         assert contract.surface_of_take(folder) is None
-        with pytest.raises(ValueError, match="surface of a take|cut short"):
+        with pytest.raises(ValueError, match="surface of a take|truncated"):
             read_surface(folder.surface)
     folder.surface.write_bytes(whole)

@@ -52,7 +52,7 @@ def test_guessed_area_is_reported_with_frames_place_and_advice():
         "Or deliver only frames 1 to 30.",
     ]
     assert unsure(verdict, FRAMES) == set(range(31, 41))
-    run = Verdict("fair", ["It does not hold in frame 40."], instants=[5, 28])
+    run = Verdict("fair", ["It does not match the clip in frame 40."], instants=[5, 28])
     advised = judge_take(facts(lost=range(31, 41)), run)
     assert advised is not None and "Try a t* nearer to frame 28." in advised.advice, "within what the run recommends"
     keyed = judge_take(facts(lost=range(31, 41), t_star_per_frame={"1": 8.0}))
