@@ -777,7 +777,7 @@ MESSAGES: dict[str, str] = {
     "{} cannot be removed: {}": "{} kann nicht entfernt werden: {}",
     "Resume it, or pick another run.": "Fortsetzen oder einen anderen Lauf wählen.",
     "More Steps": "Weitere Schritte",
-    "How many steps Train On adds to a finished run; a third of the preset's by default": "Wie viele Schritte „Weitertrainieren“ einem fertigen Lauf hinzufügt; standardmäßig ein Drittel der Vorgabe",
+    "How many steps Continue Training adds to a finished run; a third of the preset's by default": "Wie viele Schritte „Weitertrainieren“ einem fertigen Lauf hinzufügt; standardmäßig ein Drittel der Vorgabe",
     "Adds these steps to the run. The run does not change until all steps are done.": "Fügt dem Lauf diese Schritte hinzu. Der Lauf ändert sich erst, wenn alle Schritte fertig sind.",
     "The camera was solved again. Training starts over and replaces this run when done. Give the run another name to keep it.": "Die Kamera wurde neu gelöst. Das Training beginnt von vorn und ersetzt am Ende diesen Lauf. Ein anderer Name erhält ihn.",
     "Depth maps of the clip's frames, from a phone's sensor or a network: a folder of EXR, 16-bit PNG or TIFF, numbered like the frames. Scale and shift are fitted. They give the depth of movers, in the training and in frozen frames; empty: none": "Tiefenkarten der Bilder des Clips, vom Sensor eines Telefons oder von einem Netz: ein Ordner mit EXR, 16-Bit-PNG oder TIFF, nummeriert wie die Bilder. Maßstab und Versatz werden angepasst. Sie liefern die Tiefe von Bewegtem, im Training und in eingefrorenen Bildern; leer: keine",

@@ -147,6 +147,6 @@ class TrainParams:
         words="none",
         limit=Limit("number of steps to add", 1, 10_000_000, {0: "none"}),
         label="More Steps",
-        tip="How many steps Train On adds to a finished run; a third of the preset's by default",
+        tip="How many steps Continue Training adds to a finished run; a third of the preset's by default",
     )
     """Steps to add to a finished run, which keeps its settings; 0: none."""
