@@ -319,17 +319,17 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     contract.write_json(
         empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name))
     )
-    refused = contract.Status(
+    finished = contract.Status(
         "train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.computer_name()
     )
-    contract.write_json(ending.folder / "status.json", dataclasses.asdict(refused))
+    contract.write_json(ending.folder / "status.json", dataclasses.asdict(finished))
     jobs.refuse_second_writer(empty_shot)  # the process that reported its end will release the lock soon
     (empty_shot / "lock.json").unlink()
-    running = dataclasses.replace(told, state="running", started=writer.since, exit_code=None)
+    running = dataclasses.replace(finished, state="running", started=writer.since, exit_code=None)
     contract.write_json(ending.folder / "status.json", dataclasses.asdict(running))
-    with pytest.raises(contract.JobError) as told:
+    with pytest.raises(contract.JobError) as refused:
         jobs.refuse_second_writer(empty_shot)  # a local job that does not hold the lock yet is named, too
-    assert told.value.message == f"The training of {empty_shot.name} has been running on {where} since {since}."
+    assert refused.value.message == f"The training of {empty_shot.name} has been running on {where} since {since}."
     worker.kill()
     worker.wait()
     contract.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
