@@ -120,7 +120,11 @@ def test_the_panel_says_how_the_footage_was_read(addon, with_shot):
     shot = addon("shot.selection").shot_folder(with_shot)
     listing = shot / "frames" / "frames.json"
     frames_record = json.loads(listing.read_text())
-    frames_record["read_as"] = ["Read as 64 x 48, 24 fps.", 7, "Assumed, because the footage does not state it: matrix."]
+    frames_record["read_as"] = [
+        "Read as 64 x 48, 24 fps.",
+        7,
+        "Assumed, because the footage does not state it: matrix.",
+    ]
     listing.write_text(json.dumps(frames_record))
     view = addon("process.steps").STEPS["import"].view(with_shot, addon("shot.inventory").read(shot))
     assert view.state[-2:] == [frames_record["read_as"][0], frames_record["read_as"][2]]

@@ -188,7 +188,11 @@ def test_file_parameters_override_options(tmp_path, requests):
     write_json(file, {"freeze": {"width": 320, "t_star_per_frame": {"3": 4.0}}, "train": {"preset": "final"}})
     read = read_requests(str(file), requests(take="hero"))
     assert (read["freeze"].width, read["freeze"].take, read["train"].preset) == (320, "hero", "final")
-    wrongs = ({"bake": {}}, "'bake' is not one of"), ({"freeze": {"wide": 3}}, "wide"), ({"train": {"preset": "x"}}, "'x'")
+    wrongs = (
+        ({"bake": {}}, "'bake' is not one of"),
+        ({"freeze": {"wide": 3}}, "wide"),
+        ({"train": {"preset": "x"}}, "'x'"),
+    )
     for wrong, said in wrongs:
         write_json(file, wrong)
         with pytest.raises(JobError, match=said):
