@@ -326,7 +326,7 @@ def _work(frame: SourceFrame, width: int, height: int, display: Display, into: P
 def _expected(opened: Source, config: FootageConfig) -> int:
     info = opened.info
     if info.last is None:
-        return config.last - config.first + 1 if config.first and config.last else 1
+        return 1 if config.last is None else config.last - (info.first if config.first is None else config.first) + 1
     first = max(info.first, info.first if config.first is None else config.first)
     return min(info.last, info.last if config.last is None else config.last) - first + 1
 

@@ -244,10 +244,17 @@ class _Reading:
             if with_alpha and not video.has_alpha:
                 return
             last = max(frame_of)
-            alphas = iter(video.alphas(last)) if video.has_alpha else None
+            alphas = video.alphas(last) if video.has_alpha else iter(())
+            number, alpha = next(alphas, (0, None))
             for one in video.frames(None, last):
-                alpha = None if alphas is None else next((found for n, found in alphas if n == one.number), None)
+                while alpha is not None and number < one.number:
+                    number, alpha = next(alphas, (0, None))
                 if one.number in frame_of:
+                    if video.has_alpha and number != one.number:
+                        raise footage_error(
+                            f"The alpha of {frame_words([one.number])} of {path.name} can no longer be read.",
+                            "The file is damaged: export it again.",
+                        )
                     colour = plate_encoding.display(one.pixels)
                     if alpha is not None and alpha.shape != colour.shape[:2]:
                         size = colour.shape[1], colour.shape[0]

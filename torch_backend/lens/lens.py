@@ -198,6 +198,10 @@ def load_lens(shot: Shot) -> Lens | MapLens:
     model, extra, focal = record.get("camera_model"), record.get("distortion"), record.get("focal_px")
     if model is None or extra is None or not focal:
         raise JobError(f"The solve of {shot.root.name} has no lens.", "Solve the camera again.", ExitCode.SOLVE)
+    try:
+        extra, focal = [float(value) for value in extra], float(focal)
+    except (TypeError, ValueError) as error:
+        raise damaged(shot.solve_record, error) from error
     if model not in _EXTRA or len(extra) != len(_EXTRA[model]):
         raise JobError(
             f"ST maps do not support the lens of this solve, {model} with {len(extra)} numbers.",
@@ -212,6 +216,6 @@ def load_lens(shot: Shot) -> Lens | MapLens:
             ExitCode.SOLVE,
         )
     # solve.json stores the mean of fx and fy of the original frames. Undistortion scaled both by the same zoom.
-    zoom = 0.5 * (fx + fy) / float(focal)
-    terms = {name: float(value) for name, value in zip(_EXTRA[model], extra, strict=True)}
+    zoom = 0.5 * (fx + fy) / focal
+    terms = dict(zip(_EXTRA[model], extra, strict=True))
     return Lens(path.width, path.height, (fx / zoom, fy / zoom), (fx, fy), (cx, cy), **terms, model=model)

@@ -153,7 +153,8 @@ def common(request: Request) -> Common:
     with closing_database(request) as database:
         found = [database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()]
     matches = int(np.median([len(pair.matches) for pair in matched])) if matched else 0
-    return Common(max((pair.shift for pair in matched), default=0.0), len(matched), matches, int(np.median(found)))
+    features = int(np.median(found)) if found else 0
+    return Common(max((pair.shift for pair in matched), default=0.0), len(matched), matches, features)
 
 
 def only_rotates(request: Request) -> bool:

@@ -13,6 +13,7 @@ from torch_backend.contract import ExitCode, JobError
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import write_png
 from torch_backend.footage.masks import read_masks
+from torch_backend.footage.video import VideoSource
 from torch_backend.shot import Shot
 
 FRAMES = range(101, 111)
@@ -144,6 +145,15 @@ def test_the_alpha_of_a_video_masks_as_that_of_pictures_does(tmp_path, pan, reco
     for frame in (2, 7, 11):
         assert (ignored.of(frame) == ~np.roll(COVERED, frame - 1, axis=1)).all()
     assert (masks_of(shot, recorder, people="alpha")["people"].of(11) == np.roll(COVERED, 10, axis=1)).all()
+
+
+def test_a_mask_video_that_lost_the_alpha_of_a_frame_is_refused(shot, recorder, tmp_path, pan, monkeypatch):
+    """A frame without alpha would be read by its brightness."""
+    write_alpha_video(tmp_path / "m.mov", "png.mov", pan(10))
+    alphas = VideoSource.alphas
+    monkeypatch.setattr(VideoSource, "alphas", lambda self, last: (a for a in alphas(self, last) if a[0] != 4))
+    with pytest.raises(JobError, match="frame 4 of m.mov"):
+        masks_of(shot, recorder, people=tmp_path / "m.mov")
 
 
 def test_the_alpha_of_a_video_is_turned_as_its_picture_is(tmp_path, pan, recorder):

@@ -1,6 +1,7 @@
 """The lens in both directions, compared with pycolmap; the maps, compared with pictures resampled by them."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -105,6 +106,15 @@ def test_the_lens_is_colmaps_both_ways(colmap, shot_of, name):
     np.testing.assert_allclose(where, of["where"], atol=2e-5)  # the worker's values are float32
     rays = (lens.to_plate(of["points"]) - lens.centre) / lens.plate_focal
     np.testing.assert_allclose(rays, of["rays"][:, :2], atol=1e-8)
+
+
+@pytest.mark.parametrize("damage", [{"distortion": 3}, {"distortion": [None]}, {"focal_px": "wide"}])
+def test_a_damaged_record_of_the_lens_is_reported(shot_of, tmp_path, damage):
+    shot = Shot(shutil.copytree(shot_of(next(iter(LENSES))).root, tmp_path / "a.splannequin"))
+    write_json(shot.solve_record, {**json.loads(shot.solve_record.read_text()), **damage})
+    with pytest.raises(JobError) as refused:
+        load_lens(shot)
+    assert "solve.json" in refused.value.message and refused.value.exit_code == ExitCode.SOLVE
 
 
 @pytest.mark.parametrize("name", LENSES)
