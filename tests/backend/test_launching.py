@@ -251,7 +251,7 @@ def test_a_caller_that_gets_no_threads_does_it_all_itself(monkeypatch):
         patch.setattr(threading.Thread, "start", start)
         ask.carry_out(crew, 3)
     assert sorted(done) == [0, 1, 2, 3] and not ask.errors
-    assert crew._asked.empty(), "nobody would ever take what lies there"
+    assert crew._queue.empty(), "nobody would ever take what lies there"
 
 
 def test_workers_may_have_workers():

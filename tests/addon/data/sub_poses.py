@@ -26,7 +26,7 @@ def main(root: str, path: str, frame: str, depth: str, out: str) -> None:
         frames.append(OutputFrame(one.frame, torch.tensor(one.viewmat).reshape(4, 4), K, 1.0, 1.0))
     middle = next(each for each in frames if each.frame == int(frame))
     wall = torch.full((camera_path.height, camera_path.width), float(depth))
-    cameras = [*MotionBlur(frames, 180.0).beside_middle(middle, middle.K, wall), middle]
+    cameras = [*MotionBlur(frames, 180.0).sample_cameras(middle, middle.K, wall), middle]
     Path(out).write_text(json.dumps([camera.viewmat.flatten().tolist() for camera in cameras]))
 
 

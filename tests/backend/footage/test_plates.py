@@ -312,7 +312,7 @@ def test_plate_cache_is_bounded_and_keeps_recent_plates(tmp_path, pan, write_vid
     for frame in (1, 2, 3, 1, 4):
         plates.display(frame)
         assert plates.kept <= 3
-    assert list(plates._held) == [3, 1, 4]
+    assert list(plates._cache) == [3, 1, 4]
     read = []
     plain, plates = Plates._read, Plates(shot)
     plates._read = lambda frame: read.append(frame) or plain(plates, frame)

@@ -248,7 +248,7 @@ class Compositor:
 
 def _terms(target: TargetView, fillers: Fillers | None) -> dict[str, Tensor]:
     """Maps of a target view, and visibility and agreement per fill plate: see `CompositeFrame.terms`."""
-    terms = {name: getattr(target, name) for name in ("motion", "doubt", "moved", "unseen")}
+    terms = {"motion": target.motion, "doubt": target.doubt, "moved": target.moved, "unseen": target.out_of_view}
     if fillers is not None:
         for n, frame in enumerate(fillers.chosen):
             terms |= {f"shown.{frame}": fillers.visible[n], f"agreed.{frame}": fillers.agreed[n]}

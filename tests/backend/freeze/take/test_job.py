@@ -45,7 +45,7 @@ def test_a_video_that_cannot_be_replaced_is_missed_in_words_and_ends_no_freeze(q
     with missable("video", report):
         write_video(tmp_path / "video.mp4", frames, 24.0)
     (event,) = report.events
-    assert event[0] == "warning" and "The video is not written" in event[1] and "video.mp4" in event[1]
+    assert event[0] == "warning" and "The video was not written" in event[1] and "video.mp4" in event[1]
     with pytest.raises(OSError, match="No space"), missable("video", report):
         raise OSError(28, "No space left on device", "video.mp4")
 

@@ -148,7 +148,7 @@ def test_a_blurs_length_is_its_geometry():
         assert not found[:10].any()
         lower = blur.lengths(frame, frame.K, depth[20:], 20)
         np.testing.assert_allclose(lower, found[20:], atol=1e-5)
-    places = [float(camera.viewmat[0, 3]) for camera in blur.beside_middle(blur.frames[1], blur.frames[1].K, depth)]
+    places = [float(camera.viewmat[0, 3]) for camera in blur.sample_cameras(blur.frames[1], blur.frames[1].K, depth)]
     steps = np.diff(sorted([*places, -0.4]))
     assert steps.max() * 60 / 4 <= 1.0 and len(places) % 2 == 0
     assert min(places) > -0.4 - 0.2 and max(places) < -0.4 + 0.1, "within the shutter: 0.1 before, 0.2 after"
@@ -157,9 +157,9 @@ def test_a_blurs_length_is_its_geometry():
 def test_blur_samples_are_bounded_and_a_single_frame_is_sharp():
     far = MotionBlur(cameras(shifted(0.0), shifted(-9.0)), 360.0)
     depth = torch.full((48, 64), 4.0)
-    assert len(far.beside_middle(far.frames[0], far.frames[0].K, depth)) == far.config.most - 1
+    assert len(far.sample_cameras(far.frames[0], far.frames[0].K, depth)) == far.config.most - 1
     single = MotionBlur(cameras(shifted(0.0)), 360.0)
-    assert single.beside_middle(single.frames[0], single.frames[0].K, depth) == []
+    assert single.sample_cameras(single.frames[0], single.frames[0].K, depth) == []
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7, 1.5])
