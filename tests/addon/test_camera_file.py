@@ -118,7 +118,7 @@ def test_a_film_back_of_another_shape_is_said_and_its_width_is_the_frames(filmed
 
 
 def test_a_file_without_a_camera_that_moves_is_refused(contract, filmed, reading):
-    with pytest.raises(contract.JobError, match="set.abc holds no camera"):
+    with pytest.raises(contract.JobError, match="set.abc contains no camera"):
         reading()
     animated(filmed, "still", end=0.0)
     with pytest.raises(contract.JobError, match="No camera of set.abc moves"):

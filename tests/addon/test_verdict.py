@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-RUN = {"word": "fair", "sentences": ["It does not hold in frames 10 to 31, lower left."], "where": [],
+RUN = {"word": "fair", "sentences": ["It does not match the clip in frames 10 to 31, lower left."], "where": [],
        "advice": ["Choose t* in frames 34 to 73, or train only on that range."]}  # fmt: skip
 TAKE = {"word": "good", "sentences": ["98 % of the picture is plate, 2 % is a guess."]}
 
@@ -26,7 +26,7 @@ def test_run_verdict_is_under_train_and_take_verdict_under_freeze(addon, with_sh
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE, detail={"plate_share": 0.98})
     state = shots.read(shot)
     assert addon("process.steps").STEPS["train"].view(with_shot, state).state[:2] == [
-        "Fair. It does not hold in frames 10 to 31, lower left.",
+        "Fair. It does not match the clip in frames 10 to 31, lower left.",
         "Choose t* in frames 34 to 73, or train only on that range.",
     ]
     assert (
@@ -60,8 +60,8 @@ def test_verdict_does_not_repeat_warnings(addon):
 
 def test_verdicts_are_translated_to_german(addon):
     said = addon("translations").translate
-    assert said("Fair. It does not hold in frames 10 to 31, lower left.", "de_DE") == (
-        "Brauchbar. Es hält nicht in den Bildern 10 bis 31, unten links."
+    assert said("Fair. It does not match the clip in frames 10 to 31, lower left.", "de_DE") == (
+        "Brauchbar. Es gibt den Clip nicht gut wieder in den Bildern 10 bis 31, unten links."
     )
     assert said("Good. 98 % of the picture is plate, 2 % is a guess.", "de_DE") == (
         "Gut. 98 % des Bildes sind Plate, 2 % sind geraten."
