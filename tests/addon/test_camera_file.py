@@ -114,11 +114,11 @@ def test_a_film_back_of_another_shape_is_said_and_its_width_is_the_frames(filmed
     animated(filmed, "wide", film=(36.0, 20.25))
     message = reading()
     assert message["fl_x"] == pytest.approx(28.0 / 36.0 * 16) and message["fl_y"] == pytest.approx(message["fl_x"])
-    assert "is 36 x 20.25 mm, another shape" in message["splannequin"]["notes"][0][0]
+    assert "is 36 x 20.25 mm, which is a different aspect ratio" in message["splannequin"]["notes"][0][0]
 
 
 def test_a_file_without_a_camera_that_moves_is_refused(contract, filmed, reading):
-    with pytest.raises(contract.JobError, match="set.abc holds no camera"):
+    with pytest.raises(contract.JobError, match="set.abc contains no camera"):
         reading()
     animated(filmed, "still", end=0.0)
     with pytest.raises(contract.JobError, match="No camera of set.abc moves"):

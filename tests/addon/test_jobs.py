@@ -393,7 +393,7 @@ def test_a_job_whose_shot_goes_ends_in_a_sentence_and_makes_nothing(
     empty_shot.rename(moved)
     if not is_moved:
         job.process.kill()
-    with pytest.raises(contract.JobError, match="^The import ended: the shot folder .* was moved or deleted") as caught:
+    with pytest.raises(contract.JobError, match="^The import stopped: the shot folder .* was moved") as caught:
         jobs.wait(job)
     assert caught.value.exit_code == contract.ExitCode.USAGE and "where" in caught.value.hint
     assert not empty_shot.exists()
