@@ -86,7 +86,7 @@ def test_maps_match_by_number_and_unusable_ones_are_reported(world, quiet, tmp_p
     messages = found.refused_words(16)
     assert messages.startswith("4 of 16 ") and messages.count("\n") == 0
     assert all(
-        part in messages for part in ("frame 103 is missing", "frame 104 cannot be read", "64x20", "frame 106 holds")
+        part in messages for part in ("frame 103 is missing", "frame 104 cannot be read", "64x20", "frame 106 contains")
     )
 
 

@@ -150,7 +150,7 @@ def test_two_sequences_are_named_and_either_can_be_chosen(tmp_path, first, secon
     words = [template.replace("{:04d}", "####") + ".png" for template in (first, second)]
     with pytest.raises(JobError) as error:
         open_source(str(tmp_path))
-    assert f"holds 2 image sequences ({words[0]}, {words[1]})." in error.value.message
+    assert f"contains 2 image sequences ({words[0]}, {words[1]})." in error.value.message
     for chosen in (words[1], f"{second}.png".format(3)):
         assert shades_of(open_source(str(tmp_path / chosen))) == [(n, n + 8) for n in range(8)]
 
@@ -317,7 +317,7 @@ def test_pictures_of_two_sizes_are_refused(exrs):
 def test_a_folder_of_two_sequences_asks_which(exrs):
     for i in range(3):
         write(exrs / f"other.{i}.png", np.zeros((8, 8, 3), np.uint8))
-    with pytest.raises(JobError, match="holds 2 image sequences"):
+    with pytest.raises(JobError, match="contains 2 image sequences"):
         open_source(str(exrs))
     assert open_source(str(exrs / "other.1.png")).info.last == 2
 

@@ -196,7 +196,7 @@ def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path
         "Tried without success: more features, more pairs, another lens model and the global mapper."
     )
     assert [w.split("Trying again with ")[1].split()[-1] for w in report.warnings] == [
-        "too.",
+        "ones.",
         "other.",
         "(OPENCV).",
         "mapper).",

@@ -124,4 +124,5 @@ def test_footage_that_is_gone_or_another_is_not_named(tmp_path, shot_of):
 def test_picture_orientation_is_recorded(tmp_path, shot_of):
     """Blender shows pictures as stored, without their orientation tag."""
     facts = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr", Orientation=6)))[0]
-    assert facts["size"] == [96, 128] and facts["unlike"] == "its pictures are turned clockwise according to their header"
+    assert facts["size"] == [96, 128]
+    assert facts["unlike"] == "its pictures are turned clockwise according to their header"
