@@ -1,6 +1,7 @@
 """Joint bilateral filter of planes of inverse depth, as a C++ kernel compiled by Warp.
 
-As array operators it took a fifth of the time per frame: nine windows, each of some twenty passes over the picture.
+At 1920 x 1080 the kernel takes 0.16 and 0.22 CPU seconds. The same as array operators, nine windows of some twenty
+passes over the picture each, took 0.64 and 0.82 (two alternating runs).
 """
 
 from __future__ import annotations
