@@ -395,7 +395,7 @@ def test_a_job_whose_shot_goes_ends_in_a_sentence_and_makes_nothing(
         job.process.kill()
     with pytest.raises(contract.JobError, match="^The import stopped: the shot folder .* was moved") as caught:
         jobs.wait(job)
-    assert caught.value.exit_code == contract.ExitCode.USAGE and "where" in caught.value.hint
+    assert caught.value.exit_code == contract.ExitCode.USAGE and "new location" in caught.value.hint
     assert not empty_shot.exists()
     with pytest.raises(FileNotFoundError):
         jobs.new_job(empty_shot, "import", contract.ImportParams())

@@ -96,7 +96,7 @@ def test_mask_renders_one_frame_per_tick_and_cancel_restores_the_scene(addon, sh
     turns = addon("solve.drawn_masks").in_turns(drawn.session_uid, drawn.name, shot, "people")
     next(turns)
     bpy.data.masks.remove(drawn)
-    with pytest.raises(addon("solve.drawn_masks").contract.JobError, match="The mask people é is gone"):
+    with pytest.raises(addon("solve.drawn_masks").contract.JobError, match="The mask people é no longer exists"):
         next(turns)
     assert [(p.name, p.read_bytes()) for p in into.iterdir()] == [("000005.png", b"of before")]
 

@@ -137,7 +137,7 @@ def test_oversized_paint_is_not_loaded(matted, scene):
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
     (matted / "motion_paint").mkdir()
     (matted / "motion_paint" / "000006.png").write_bytes(content)
-    with pytest.raises(RuntimeError, match=r"000006\.png is 16000 x 16000 pixels"):
+    with pytest.raises(RuntimeError, match=r"000006\.png has 16000 x 16000 pixels"):
         bpy.ops.splannequin.paint_motion()
 
 
