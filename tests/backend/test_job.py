@@ -75,13 +75,13 @@ def test_what_a_station_foretells_is_what_is_left(shot, monkeypatch):
         (JobError("No people.", "Film some.", ExitCode.FOOTAGE), ExitCode.FOOTAGE, "No people."),
         (contract.UserError("The width is -1."), ExitCode.USAGE, "The width is -1."),
         (contract.MissingError("There is no clip."), ExitCode.USAGE, "There is no clip."),
-        (ValueError("operands could not be broadcast\n  together"), ExitCode.INTERNAL, "import step broke: ValueError"),
-        (FileNotFoundError("libx.so"), ExitCode.INTERNAL, "import step broke: FileNotFoundError"),
-        (KeyError("frames"), ExitCode.INTERNAL, "import step broke"),
+        (ValueError("operands could not be broadcast\n  together"), ExitCode.INTERNAL, "import step failed: ValueError"),
+        (FileNotFoundError("libx.so"), ExitCode.INTERNAL, "import step failed: FileNotFoundError"),
+        (KeyError("frames"), ExitCode.INTERNAL, "import step failed"),
         (OSError(28, "No space left on device"), ExitCode.DISK, "No space left"),
-        (ZeroDivisionError("oops"), ExitCode.INTERNAL, "import step broke"),
+        (ZeroDivisionError("oops"), ExitCode.INTERNAL, "import step failed"),
         (RuntimeError("CUDA out of memory"), ExitCode.INTERNAL, "Out of memory"),
-        (ModuleNotFoundError("No module named 'torch_backend.x'", name="torch_backend.x"), ExitCode.INTERNAL, "broke"),
+        (ModuleNotFoundError("No module named 'torch_backend.x'", name="torch_backend.x"), ExitCode.INTERNAL, "failed"),
     ],
 )
 def test_errors_become_a_sentence(shot, monkeypatch, error, code, word):
@@ -98,7 +98,7 @@ def test_errors_become_a_sentence(shot, monkeypatch, error, code, word):
     if got == ExitCode.INTERNAL:
         log = (folder / contract.LOG_FILE).read_text()
         assert "Traceback" in log and type(error).__name__ in log
-        assert "broke" not in word or str(folder / contract.LOG_FILE) in status.hint
+        assert "failed" not in word or str(folder / contract.LOG_FILE) in status.hint
 
 
 def test_what_a_user_can_put_right_is_a_value_error_to_whoever_tries(shot):

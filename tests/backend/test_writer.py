@@ -207,7 +207,7 @@ CROWD = """
 import dataclasses, json, os, random, sys, time
 from pathlib import Path
 from torch_backend import contract
-from torch_backend.writer import _bury, only_writer, patient_writer
+from torch_backend.writer import _remove_lock, only_writer, patient_writer
 
 root, dead, mark, seed = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), int(sys.argv[4])
 random.seed(seed)
