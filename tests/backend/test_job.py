@@ -75,7 +75,7 @@ def test_what_a_station_foretells_is_what_is_left(shot, monkeypatch):
         (JobError("No people.", "Film some.", ExitCode.FOOTAGE), ExitCode.FOOTAGE, "No people."),
         (contract.UserError("The width is -1."), ExitCode.USAGE, "The width is -1."),
         (contract.MissingError("There is no clip."), ExitCode.USAGE, "There is no clip."),
-        (ValueError("operands could not be broadcast\n  together"), ExitCode.INTERNAL, "import step failed: ValueError"),
+        (ValueError("operands could not be broadcast\n  together"), ExitCode.INTERNAL, "step failed: ValueError"),
         (FileNotFoundError("libx.so"), ExitCode.INTERNAL, "import step failed: FileNotFoundError"),
         (KeyError("frames"), ExitCode.INTERNAL, "import step failed"),
         (OSError(28, "No space left on device"), ExitCode.DISK, "No space left"),

@@ -59,7 +59,7 @@ def test_smaller_presets_take_less_and_what_fits_an_hour_is_named():
         "The training takes about 2.5 h more on the processor.",
         "It can be paused at any time and continues where it stopped. The preset standard would take about 50 min.",
     )
-    assert "fewer Gaussians" in warning_of(9000.0, 1280, False, [])[1]
+    assert "number of Gaussians" in warning_of(9000.0, 1280, False, [])[1]
     assert warning_of(3600.0, 1280, False, rows) is None
 
 

@@ -39,7 +39,7 @@ def test_smaller_gpus_get_fewer_gaussians_with_a_note():
     plans = {card: plan(card) for card in (4, 6, 8, 12)}
     counts = [found.gaussians for found in plans.values()]
     assert counts == sorted(counts) and counts[0] < 1_000_000
-    assert plans[4].pieces == PIECE and f"{counts[0]:,} at most" in plans[4].sentence
+    assert plans[4].pieces == PIECE and f"at most {counts[0]:,}" in plans[4].sentence
     assert "4.0 GB" not in plans[4].sentence and "3.1 GB free" in plans[4].sentence
     assert plans[12] == MemoryPlan(1_000_000, None, False, ""), "12 GB hold a million, with the frames in host memory"
 
