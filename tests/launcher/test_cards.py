@@ -52,7 +52,7 @@ def test_torch_without_cuda_is_what_is_wrong(nvidia_smi):
 
 def test_a_torch_with_cuda_that_sees_no_card_is_not_said_to_be_without(nvidia_smi):
     nvidia_smi(GOOD)
-    assert "does not see NVIDIA GeForce RTX 3090, though" in findings(CUDA)["torch on gpu"]
+    assert "does not see NVIDIA GeForce RTX 3090, although" in findings(CUDA)["torch on gpu"]
     used = {"torch_device": "cuda", "trains_on": "cuda", "torch_cuda": "13.0", "cuda_refusal": ""}
     assert list(findings(used)) == ["gpu"]
     warp = {**used, "trains_on": "cpu", "cuda_refusal": "PyTorch sees the NVIDIA GPU, but Warp does not."}

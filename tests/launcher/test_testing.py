@@ -86,7 +86,7 @@ from launcher.testing import Leg, run_legs
 folder = pathlib.Path(sys.argv[2])
 legs = [Leg(name, [sys.executable, "-c", sys.argv[1], str(folder / name)]) for name in ("one", "two", "three")]
 try:
-    run_legs(legs, sys.executable, folder, at_once=2)
+    run_legs(legs, sys.executable, folder, parallel=2)
 except KeyboardInterrupt:
     sys.exit(130)
 """
