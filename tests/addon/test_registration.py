@@ -115,7 +115,7 @@ mine = known()
 errors = []
 assert addon_utils.enable(second, handle_error=errors.append) is None
 assert known() is mine and hasattr(bpy.types.Scene, "splannequin"), "the first goes on working"
-assert f"enabled already, as {first}" in str(errors[0]), errors
+assert f"is already enabled as {first}" in str(errors[0]), errors
 addon_utils.disable(second)
 assert known() is mine and hasattr(bpy.types.Scene, "splannequin")
 bpy.ops.splannequin.set_up.poll()

@@ -75,7 +75,7 @@ def test_what_is_no_file_is_refused_by_its_name(tmp_path: Path, reader: str, kin
 def test_a_colmap_model_of_sparse_files(tmp_path: Path):
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         make(tmp_path / name, "sparse")
-    with pytest.raises(UnreadableFile, match=r"cameras\.bin has 42\.9 GB"):
+    with pytest.raises(UnreadableFile, match=r"cameras\.bin is 42\.9 GB"):
         read_model(tmp_path)
 
 
