@@ -314,7 +314,7 @@ def snapshot(folder: Path) -> dict[str, str]:
         if path.name in (contract.WRITER_FILE, contract.METRICS_FILE, "blender.log", "colmap.log"):
             continue  # metrics and logs hold seconds in each line
         if ".kept." in path.name:
-            continue  # an import keeps pictures that a damaged frames.json no longer lists, see strangers.py
+            continue  # an import keeps pictures that a damaged frames.json no longer lists, see foreign_files.py
         if path.suffix == ".blend1":
             continue  # Blender's backup of an earlier bake
         found[name] = _digest(path, str(folder))

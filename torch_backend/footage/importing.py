@@ -38,6 +38,7 @@ from .bars import Bars, find_bars
 from .burnt_in import WIDTH, find_mark, looked_at
 from .display import PLAIN, ROLLED, Display, clipped_share
 from .earlier_work import EarlierWork, SamePictures, digest_of, footage_key
+from .foreign_files import keep_foreign_files
 from .images import is_whole_png, read_frame, resize, working_size, write_png
 from .import_findings import Extracted, refuse_cuts, refuse_unusable, remarks
 from .numbering import recorded_shift, renumbered, shift_of
@@ -54,7 +55,6 @@ from .sources import (
     footage_error,
     overrides_of,
 )
-from .strangers import keep_foreign_files
 
 FRAMES_VERSION = 1
 _WRITERS = 2

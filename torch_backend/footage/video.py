@@ -101,8 +101,7 @@ class VideoSource:
             self._is_picture = container.format.name in _ANIMATED_PICTURES
             orientation = UPRIGHT if (matrix := display_matrix(frame)) is None else orientation_of_matrix(matrix)
             self._orientation, self._rotation = orientation or UPRIGHT, frame.rotation
-            # FFmpeg derives the stream's pixel aspect from the display matrix. If that matrix is not applied, use the
-            # codec's pixel aspect.
+            # FFmpeg's aspect of the stream includes the display matrix. If that is not applied, the codec's is right.
             aspect = overrides.pixel_aspect or pixel_aspect(stream if orientation else stream.codec_context)
             self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
             look = look_space(overrides.look) if overrides.look else None
@@ -117,8 +116,7 @@ class VideoSource:
             self._interlaced = bool(frame.interlaced_frame or self._fields)
             self._promise = promise(container, stream, rate)
             self._alpha_decoder = alpha_decoder_of(stream)
-            has_alpha_plane = any(component.is_alpha for component in frame.format.components)
-            self.has_alpha = has_alpha_plane or bool(self._alpha_decoder)
+            self.has_alpha = bool(self._alpha_decoder) or any(part.is_alpha for part in frame.format.components)
             """True if the clip has an alpha that `alphas` can read."""
             self._warn_about(frame)
             if orientation is None:
@@ -129,8 +127,7 @@ class VideoSource:
                 "pixel_aspect_told": aspect is not None,
                 **self._reading_of(container, stream),
             }
-        stat = path.stat()
-        reading_key = self._reading_key()
+        stat, reading_key = path.stat(), self._reading_key()
         self.info = SourceInfo(
             width=width,
             height=height,

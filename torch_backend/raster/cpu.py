@@ -261,19 +261,9 @@ class _Rasterize(torch.autograd.Function):
             _forward_camera(lease.workspace, scene, channels)
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(
-                means,
-                quats,
-                log_scales,
-                logits,
-                colors,
-                sh,
-                sh_rest,
-                viewmats,
-                background,
-                image,
-                alpha,
+                means, quats, log_scales, logits, colors, sh, sh_rest, viewmats, background, image, alpha,
                 channel_background,
-            )
+            )  # fmt: skip
             ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
         ctx.mark_non_differentiable(median, radii, means2d, weights, top_ids, top_weights)
         ctx.set_materialize_grads(False)
@@ -282,20 +272,8 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: _Context, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         saved, scene = _Saved(*ctx.saved_tensors), ctx.scene
-        (
-            means,
-            quats,
-            log_scales,
-            logits,
-            colors,
-            sh,
-            sh_rest,
-            viewmats,
-            background,
-            image,
-            alpha,
-            channel_background,
-        ) = saved
+        (means, quats, log_scales, logits, colors, sh, sh_rest, viewmats, background, image, alpha,
+         channel_background) = saved  # fmt: skip
         grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
         grad_alpha = torch.zeros_like(alpha) if grads[1] is None else grads[1].contiguous()
         parameters = {

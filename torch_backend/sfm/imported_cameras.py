@@ -75,8 +75,7 @@ def take_over(
         report: receives progress.
 
     Returns:
-        The worker's answer as after a solve, with two more fields: "given" is the kind of the file, and "world" the
-        world of the file's cameras.
+        The worker's answer as after a solve, plus "given", the kind of the file, and "world", that of its cameras.
 
     Raises:
         JobError: the worker crashed, or no point agrees with the cameras.
