@@ -155,6 +155,7 @@ class FusedAdam(torch.optim.Optimizer):
         real = table.values[rows * _WHOLE :].view(np.float32).reshape(rows, _REAL)
         real[rows - len(table.group_of) :] = self._rates()[table.group_of]
         values: Tensor = torch.from_numpy(table.values)  # pyright: ignore[reportUnknownMemberType]
+        # Only a copy from pinned memory runs asynchronously.
         values = values.pin_memory() if table.sent.device.type == "cuda" else values
         table.sent[: len(values)].copy_(values, non_blocking=True)
 
@@ -200,6 +201,7 @@ class FusedAdam(torch.optim.Optimizer):
         for p, group in found:
             self._check(p, device)
             m, v, t = self._state_of(p)
+            # The compiled code walks p, g, m and v as flat memory, so their layouts must agree.
             grad = p.grad if p.grad.stride() == p.stride() else torch.empty_like(p).copy_(p.grad)
             factor = _factors(p, group)
             kept += [grad] if factor is None else [grad, factor]
@@ -244,6 +246,7 @@ class FusedAdam(torch.optim.Optimizer):
             torch.tensor(values, dtype=kind, device="cpu")
             for values, kind in ((whole, torch.int64), (real, torch.float32))
         )
+        # Stage 0 checks all gradients before stage 1 changes anything: a step is applied as a whole or not at all.
         for stage in (0, 1):
             _snippet().run(
                 self.threads, stage, whole=table.data_ptr(), real=numbers.data_ptr(), bad=bad.data_ptr(),
@@ -290,6 +293,7 @@ class FusedAdam(torch.optim.Optimizer):
             sent = self._recorded.filled(table, plan.group_of)
         mask = 0 if visible is None else visible.data_ptr()
         wholes, reals = sent[: segments * _WHOLE], sent[segments * _WHOLE :].view(torch.float32)
+        # Launches run in order: all gradients are checked, then step counts advance, then parameters change.
         for stage, threads in ((0, chunks * _CHUNK), (1, segments), (2, chunks * _CHUNK)):
             inputs = [wholes.data_ptr(), reals.data_ptr(), bad.data_ptr(), mask, segments, stage]
             launch_on(_kernel(), threads, inputs, device)

@@ -41,12 +41,12 @@ def begun(run: Path, key: str) -> Path | None:
 def replace_run(run: Path, done: Path) -> None:
     """Moves the run trained in `done`, a folder of `folder_for`, to the run's folder. Removes unfinished trainings.
 
-    Every file is replaced atomically, the checkpoint first, so that a freeze reads either the old run or the new one.
-    `finish_replacing` resumes after a killed process.
+    Every file is replaced atomically. `finish_replacing` resumes after a killed process.
     """
     # Without the checkpoint in `done`, a killed process may already have moved the depth file.
     if not (done / DEPTH_FILE).is_file() and (done / CHECKPOINT_FILE).is_file():
         remove_file(run / DEPTH_FILE)
+    # The checkpoint first, so that a freeze reads either the old run or the new one.
     for name in (CHECKPOINT_FILE, DEPTH_FILE, CONFIG_FILE, METRICS_FILE):
         if (done / name).is_file():
             replace_file(done / name, run / name)
@@ -54,6 +54,7 @@ def replace_run(run: Path, done: Path) -> None:
         shutil.rmtree(run / PREVIEWS_FOLDER, ignore_errors=True)
         replace_file(done / PREVIEWS_FOLDER, run / PREVIEWS_FOLDER)
     remove_file(run / EXTENSION_FILE)
+    # Last, because `finish_replacing` recognises an unfinished replacement by this file.
     replace_file(done / SUMMARY_FILE, run / SUMMARY_FILE)
     shutil.rmtree(run / NEXT_FOLDER, ignore_errors=True)
 

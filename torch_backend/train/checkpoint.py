@@ -99,16 +99,14 @@ def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) 
 
 
 def restore_optimizer(named: dict[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Inverse of `optimizer_state`. Moments get the device, dtype and memory layout of their parameter.
-
-    They are converted at once, because Gaussians and moments may be cloned and dropped before the next step.
-    """
+    """Inverse of `optimizer_state`. Moments get the device, dtype and memory layout of their parameter."""
     for name, parameter in named.items():
         keys = ("step", "exp_avg", "exp_avg_sq")
         stored = {key: tensors.get(f"adam.{key}.{name}") for key in keys}
         state: dict[str, Tensor] = {}
         for key, value in stored.items():
             if value is not None:
+                # Converted here, not at the next step: Gaussians and moments may be cloned and dropped before it.
                 like = torch.zeros((), device=parameter.device) if key == "step" else parameter.detach()
                 state[key] = torch.empty_like(like).copy_(value)
         if len(state) == len(keys):

@@ -175,6 +175,7 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
     config.host = params.method if params.method in hosts() else params.host
     config.host_config = params.host_config
     if params.host_config == "reference":
+        # The published code detaches the reference state, but not the canonical parameters that both states share.
         config.supervision.pulls = "all"
     _gate_for(config)
     if config.method != "auto" or not config.decides:
@@ -187,8 +188,8 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
     return config
 
 
+# Length in steps of the run for which the learning rates in TrainConfig were tuned.
 _RATES_FOR = 3000
-"""Length in steps of the run for which the learning rates in TrainConfig were tuned."""
 
 
 def _rates_for(config: TrainConfig) -> None:
@@ -199,13 +200,13 @@ def _rates_for(config: TrainConfig) -> None:
     config.densify.every = min(100, max(50, round(config.iterations / 30)))
 
 
+# Length of the static phase of a gated run, as a share of the run and as a maximum in steps. During a longer phase,
+# moving objects are fitted by ghosts: Gaussians far behind the object that each match one view only. The field cannot
+# correct them (docs/decisions.md, "Gate and field").
 _STATIC, _MOST_STATIC = 0.2, 600
-"""Length of the static phase of a gated run, as a share of the run and as a maximum in steps. During a longer phase,
-moving objects are fitted by ghosts: Gaussians far behind the object that each match one view only. The field cannot
-correct them (docs/decisions.md, "Gate and field")."""
+# Maximum number of steps between two raises of the SH degree. Long runs need no more. The smaller interval of a short
+# run must not be shortened further, or no degree would gain enough to be kept.
 _MOST_PER_DEGREE = 1350
-"""Maximum number of steps between two raises of the SH degree. Long runs need no more. The smaller interval of a short
-run must not be shortened further, or no degree would gain enough to be kept."""
 
 
 def _gate_for(config: TrainConfig) -> None:

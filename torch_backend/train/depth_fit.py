@@ -2,13 +2,7 @@
 
 A map is linear in depth (a sensor, a metric network) or in inverse depth (disparity). Both models are fitted to the
 whole sequence, and the better one is used. Each frame has its own line, shrunk towards the sequence's common line
-according to the spread between frames and the line's uncertainty (empirical Bayes). So a metric sequence gets one line,
-a network that normalises each image gets many, and a frame with few points gets the common line.
-
-Map values are regressed on the points' depth. Points are accurate to about 1 % and maps are less accurate; a line
-fitted to noisy abscissas would be too flat. The fit uses least absolute deviations, because an occluded point is paired
-with the value of its occluder. A redescending estimator would fail where most points lie on one wall: it would treat
-all other points as outliers.
+according to the spread between frames and the line's uncertainty (empirical Bayes).
 """
 
 from __future__ import annotations
@@ -30,12 +24,12 @@ LEAST_SIGMA = 0.01
 """Least standard deviation of a fitted depth, as a share of the frame's median depth: the points' own error."""
 _ROUNDS = 30
 """Iterations of reweighted least squares."""
+# Ratio of standard deviation to median absolute deviation, for normally distributed errors.
 _TO_SIGMA = 1.4826
-"""Ratio of standard deviation to median absolute deviation, for normally distributed errors."""
+# Maps fit the solve if less than half of their deviation is unexplained by the points' depth, and the median relative
+# error is below 15 %. Networks reach 5 to 12 %; mirrored maps of the same room reach 23 %. Maps also fit if the error
+# is below 5 %, because points that all lie at one depth cannot explain any deviation.
 _UNEXPLAINED, _FAR, _CLOSE = 0.5, 0.15, 0.05
-"""Maps fit the solve if less than half of their deviation is unexplained by the points' depth, and the median relative
-error is below 15 %. Networks reach 5 to 12 %; mirrored maps of the same room reach 23 %. Maps also fit if the error is
-below 5 %, because points that all lie at one depth cannot explain any deviation."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +97,8 @@ def _fit(samples: Samples, enough: list[int], kind: str) -> SequenceFit:
     errors, unexplained = list[float](), list[float]()
     for frame in enough:
         line, covariance = lines_by_frame[frame]
+        # A metric sequence gets one line, a network that normalises each image many, a frame with few points the common
+        # one.
         line = common + between @ np.linalg.pinv(between + covariance) @ (line - common)
         values, y = of(frame)
         fit = _frame_fit(line, 0.0, len(y))
@@ -128,10 +124,14 @@ def _frame_fit(line: Array, sigma: float, points: int) -> FrameFit:
 
 def _line(values: Array, y: Array) -> tuple[Array, Array]:
     """(line [2], covariance [2, 2]): slope and shift of values [P] over y [P] by least absolute deviations."""
+    # Values over depth, not depth over values: points are accurate to 1 %, maps less, and noisy abscissas would flatten
+    # the line.
     rows = np.stack([y, np.ones_like(y)], axis=1)
     weight = np.ones_like(y)
     line = np.zeros(2)
     least = 1e-6 * max(float(np.abs(values - np.median(values)).mean()), 1e-12)
+    # Absolute deviations, because an occluded point is paired with the value of its occluder. Where most points lie on
+    # one wall, a redescending estimator would treat all others as outliers.
     for _ in range(_ROUNDS):
         weighted = rows * weight[:, None]
         line = np.asarray(np.linalg.lstsq(weighted.T @ rows, weighted.T @ values, rcond=None)[0], np.float64)

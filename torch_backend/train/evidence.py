@@ -1,8 +1,7 @@
 """Measures residual and motion of a trained run in its frames, on which the verdict is based.
 
-The residual compares low frequencies of a frame and of the render at its time: a difference means wrong content, not
-lack of sharpness. Motion is how far visible surfaces travel over the clip, projected into the frame's camera. Only
-times at which a surface was seen count.
+The residual compares low frequencies of a frame and of the render at its time. Motion is how far visible surfaces
+travel over the clip, projected into the frame's camera. Only times at which a surface was seen count.
 """
 
 from __future__ import annotations
@@ -52,8 +51,7 @@ class FrameEvidence:
     unexplained: NDArray[np.float32]
     """[GRID, GRID] share of each cell's pixels that differ by more than `UNEXPLAINED`; top row first."""
     travel: NDArray[np.float32]
-    """[GRID, GRID] travel of the surfaces in each cell, as a share of the width. It is the 97th percentile, so that a
-    moving object that covers 0.2 % of the image counts."""
+    """[GRID, GRID] 97th percentile of the surfaces' travel in each cell, as a share of the width."""
     moving: NDArray[np.float32]
     """[K] travel of every 16th moving pixel of the image, as a share of the width."""
     still_unexplained: float | None = None
@@ -142,6 +140,7 @@ def _inspect_frame(
     moving = travels[travels > STILL_SHARE].flatten()[::16]
     still = None if matte is None else _resized(matte == STILL, is_unexplained.shape)
     unexplained_share = None if still is None or not still.any() else float(is_unexplained[still].float().mean())
+    # Above the 97th percentile of a cell lies 0.2 % of the image: a mover of that size still counts.
     return FrameEvidence(
         trainer.scene.frames[index], held_out, psnr(rendered, plate, ignored), shares(is_unexplained.float()),
         _cells(travels, 0.97), moving.numpy(), unexplained_share,
@@ -153,6 +152,7 @@ def unexplained(plate: Tensor, rendered: Tensor) -> Tensor:
     """bool [H, W] on the CPU, True where low frequencies of two images [H, W, 3] differ by more than `UNEXPLAINED`."""
     radius = max(1, round(BLUR * plate.shape[1]))
     difference = (plate - rendered).permute(2, 0, 1)[None]
+    # Low frequencies only: their difference is wrong content, not lack of sharpness. Two boxes approximate a Gaussian.
     for _ in range(2):
         difference = F.avg_pool2d(difference, 2 * radius + 1, 1, radius, count_include_pad=False)
     return (difference[0].abs().mean(0) > UNEXPLAINED).cpu()

@@ -90,6 +90,7 @@ class Exposure:
         if not self.config.on:
             return color
         gain, offset = self.at(time)
+        # Premultiplied colour: the offset applies only to the covered share of a pixel.
         return _exposed(color, gain, offset) if alpha is None else color * gain + offset * alpha[..., None]
 
     def apply_at(self, color: Tensor, bins: Tensor, shares: Tensor) -> Tensor:

@@ -13,8 +13,8 @@ from typing import Any
 from ..contract import EXTENSION_FILE as EXTENSION_FILE
 from .checkpoint import read_meta
 
+# Maximum rewind of the learning rate schedule, as a share of the run.
 _REWIND = 1.0 / 3.0
-"""Maximum rewind of the learning rate schedule, as a share of the run."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,9 @@ class Extension:
         """Progress, in a run of `iterations` steps, at which learning rates are evaluated.
 
         The schedule is rewound by the number of added steps, at most by a third of the run, and then runs to its end
-        again. At the final rates the model would hardly change; high rates for a few steps would leave noise.
+        again.
         """
+        # At the final rates the model would hardly change; high rates for a few steps would leave noise.
         back = min(self.steps / iterations, _REWIND)
         done = min(max((iteration - self.from_iteration) / self.steps, 0.0), 1.0)
         return 1.0 - back * (1.0 - done)

@@ -12,9 +12,9 @@ from torch import Tensor
 from ..scene import Scene
 from ..torch_types import from_numpy
 
+# Masked share of a training pixel above which the pixel is ignored. It is low because mixed pixels at the mask's edge
+# would still train the model on the colour of a logo.
 _COVERED = 0.1
-"""Masked share of a training pixel above which the pixel is ignored. It is low because mixed pixels at the mask's edge
-would still train the model on the colour of a logo."""
 
 Masks = Callable[[int], "NDArray[np.bool_] | None"]
 """Frame number -> bool [h, w] ignored pixels; None if there are none."""

@@ -17,8 +17,8 @@ from .depth import FittedDepth, load_fitted
 from .identity import has_changed_pictures, solve_key
 from .model import DynamicModel, restore_model
 
+# Number of attempts to read a checkpoint that is replaced during reading. Training writes one every 30 s.
 _ATTEMPTS = 5
-"""Number of attempts to read a checkpoint that is replaced during reading. Training writes one every 30 s."""
 
 
 @dataclass

@@ -58,15 +58,12 @@ def psnr(image: Tensor, target: Tensor, ignored: Tensor | None = None) -> float:
     """
     squares = (image.clamp(0.0, 1.0).double() - target.double()).square()
     error = squares.mean() if ignored is None else squares[~ignored].mean()
-    return float(-10.0 * torch.log10(error.clamp_min(1e-12)))
+    return float(-10.0 * torch.log10(error.clamp_min(1e-12)))  # identical images: 120 dB, not infinity
 
 
 @functools.lru_cache(maxsize=8)
 def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """[size, size] matrix that blurs along an axis; rows sum to 1.
-
-    On the CPU, two dense products are faster than torch's depthwise 11-tap convolution at these sizes.
-    """
+    """[size, size] matrix that blurs along an axis; rows sum to 1."""
     offset = torch.arange(size, dtype=torch.float64, device="cpu")
     distance = offset[:, None] - offset[None, :]
     weights = torch.exp(-0.5 * (distance / _SIGMA).square()) * (distance.abs() <= _WINDOW // 2)
@@ -75,6 +72,7 @@ def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def _blur(x: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     """rows @ x @ columns^T for x [C, H, W]."""
+    # At these sizes, two dense products on the CPU are faster than torch's depthwise 11-tap convolution.
     return torch.matmul(torch.matmul(rows, x), columns.T)
 
 

@@ -1,10 +1,8 @@
 """Computes the GPU memory that a run needs, and reduces a run that does not fit before it starts.
 
 The figures are bytes of the tensors that exist at the same time in a training step. `tests/backend/card/test_card.py`
-compares them with the count of a simulated GPU. `_FIXED` is the memory of torch, its libraries and the compiled
-kernels; `_WASTE` accounts for fragmentation. Neither was measured on a GPU. A run that does not fit is reduced in this
-order: frames stay in host memory; the field is evaluated in pieces that are recomputed in the backward pass; the number
-of Gaussians is lowered.
+compares them with the count of a simulated GPU. A run that does not fit is reduced in this order: frames stay in host
+memory; the field is evaluated in pieces that are recomputed in the backward pass; the number of Gaussians is lowered.
 """
 
 from __future__ import annotations
@@ -25,14 +23,14 @@ LEAST_PIECE = 8_192
 """Least size of a piece. Smaller pieces save no significant memory."""
 LEAST = 2_000
 """Least number of Gaussians of a run."""
+# Fixed memory in bytes: torch, its libraries, the kernels and small tensors. An estimate, not measured on a GPU.
 _FIXED = 450_000_000
-"""Fixed memory in bytes: libraries, kernels and small tensors."""
+# Memory that the allocator reserves through fragmentation, as a multiple of the memory in use. An estimate, too.
 _WASTE = 1.15
-"""Memory that the allocator reserves, as a multiple of the memory in use."""
 _MOVED = 14
 """Number of values per Gaussian that a field changes."""
+# Mean number of tiles per Gaussian, including Gaussians out of view, in the benchmark's scenes; rounded up.
 _TILES = 12
-"""Mean number of tiles per Gaussian, including Gaussians out of view, in the benchmark's scenes; rounded up."""
 _RASTER_BYTES = 240
 """Bytes per Gaussian in a frame: record, order, keys, scratch memory of the sort, statistics, projected gradients."""
 _PIXEL_BYTES = 230
@@ -61,6 +59,7 @@ def gaussian_bytes(config: TrainConfig, bins: int) -> int:
     """
     harmonics = 3 * (config.sh_degree + 1) ** 2
     numbers = 11 + harmonics
+    # A list of hits has room for a third more than its largest demand (`hit_lists.py`).
     hits = math.ceil(_TILES * 4 / 3) * HIT_BYTES
     return 4 * (5 * numbers + 2 * harmonics) + _RASTER_BYTES + hits + 2 * min(bins, MAX_BINS) + 40
 

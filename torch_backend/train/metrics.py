@@ -76,7 +76,7 @@ def _iteration_of(line: str) -> float:
     """Iteration of a line of metrics.jsonl; infinite if the line is incomplete."""
     try:
         return float(json.loads(line)["iteration"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):  # a killed process may leave half a line
         return float("inf")
 
 

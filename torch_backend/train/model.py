@@ -135,13 +135,10 @@ def render(
 def gathered(
     state: Mapping[str, Tensor], viewmat: Tensor, K: Tensor, width: int, height: int, weights: Tensor
 ) -> Tensor:
-    """[N, C] blending weights (alpha * T) of the Gaussians in one camera, summed over pixels with `weights` [H, W, C].
-
-    A pixel's gradient with respect to a Gaussian's colour is that blending weight, so one backward pass computes the
-    sums.
-    """
+    """[N, C] blending weights (alpha * T) of the Gaussians in one camera, summed over pixels with weights [H, W, C]."""
     detached = {name: value.detach() for name, value in state.items()}
     with torch.enable_grad():
+        # The gradient of a pixel by a Gaussian's colour is its blending weight: one backward pass sums all of them.
         ink = torch.zeros(len(detached["means"]), weights.shape[2], device=weights.device, requires_grad=True)
         out = render(detached, 0, viewmat, K, width, height, colors=ink, with_contributions=False)
         return weighted_gradient(out.colors[0, ..., 3:], ink, weights.to(ink))

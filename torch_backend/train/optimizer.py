@@ -15,8 +15,8 @@ from .config import TrainConfig
 from .model import DynamicModel
 from .poses import Poses
 
+# Published share of the run at which the field is added, for which the hosts' learning rates are tuned.
 _USUAL = GateConfig().start
-"""Published share of the run at which the field is added, for which the hosts' learning rates are tuned."""
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 
 
@@ -42,20 +42,18 @@ def optimizer_of(model: DynamicModel, poses: Poses, config: TrainConfig) -> Fuse
     if c.poses.on:
         lr = c.poses.lr
         groups.append({"params": [poses.values], "lr_start": lr, "lr_end": 0.1 * lr, "until": c.poses.until})
+    # As in 3DGS: gradients of single Gaussians are often below torch's default of 1e-8.
     return FusedAdam(groups, eps=1e-15)
 
 
 def add_field(optimizer: FusedAdam, field: Deformation, model: Gaussians, config: TrainConfig, share: float) -> None:
-    """Adds the parameters of a field, at a `share` of its learning rates, and the parameters it owns per Gaussian.
-
-    Rates fall over the run, and the hosts' schedules are tuned for a field that is added after a third of it. A field
-    that is added earlier starts at the rate of that point. At 1.7 times this rate, the field may become unstable
-    (docs/decisions.md, "Gate and field").
-    """
+    """Adds the parameters of a field, at a `share` of its learning rates, and the parameters it owns per Gaussian."""
     joins = config.gate.start if config.method == "auto" else _USUAL
     for group in field.parameter_groups():
         start, end = share * group["lr"], share * group["lr_end"]
         since, until = group.get("since", 0.0), group.get("until", 1.0)
+        # Hosts are tuned for a field that is added after a third of the run. A field that is added earlier starts at
+        # the rates of that point: at the full rates, two of six runs diverged (docs/decisions.md).
         if joins < _USUAL < until and since < _USUAL:
             start *= (end / start) ** ((_USUAL - since) / (until - since))
             since = joins

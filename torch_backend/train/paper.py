@@ -51,16 +51,19 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
     exposed = model.exposure.apply(second_out.colors[0], run.times[second])
     ignored = run.ignored_at(run.train_ids[second])
     loss = photometric(exposed, run.image_of(second), run.config.dssim, ignored)
+    # With `pulls` all, the terms below use this graph again.
     backward(loss, retain_graph=True)
     second_supervised = _supervised(run, second, rows, second_state, second_out)
     every = supervision.pulls == "all"
     if not every:
+        # The published code also pulls canonical parameters. That cost 4DGaussians 0.32 dB (docs/decisions.md).
         second_state = model.state_at(run.times[second], canonical=False)
     views = [
         _view(run, model.state_at(run.times[frame], canonical=every), frame, rows, supervised),
         _view(run, second_state, second, rows, second_supervised),
     ]
     loss = paper_loss(views[0], views[1], run.progress, supervision)
+    # A gradient that is not finite would make the optimiser skip the photometric loss of the step, too.
     if loss is not None and bool(torch.isfinite(loss)):
         backward(loss)
     return second

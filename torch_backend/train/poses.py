@@ -1,9 +1,7 @@
 """Pose refinement: a small rigid correction per training frame, optimised while the model is static, then frozen.
 
-A corrected camera is viewmat @ exp(correction). The correction moves the world as seen by that frame's camera, so the
-mean correction of all frames would move the world itself. It is subtracted after every step (the gauge): the Gaussians
-stay in the solve's frame, and corrections only describe how frames disagree. Frames that are not trained on get
-corrections interpolated in time.
+A corrected camera is viewmat @ exp(correction). The mean correction is subtracted after every step (the gauge).
+Frames that are not trained on get corrections interpolated in time.
 
 Corrections are used in training only. Takes are rendered from the solve's cameras or from the user's, which are the
 cameras in Blender; renders from refined cameras would not align with other objects of the Blender scene.
@@ -25,7 +23,7 @@ class PosesConfig:
     """Settings of pose refinement. Shares are of the run's length."""
 
     on: bool = False
-    """Whether cameras are refined. Off by default; docs/architecture.md has its effect on test clips."""
+    """Whether cameras are refined. Off by default; docs/decisions.md has its effect on test clips."""
     start: float = 0.1
     """Share of the run at which refinement begins. Before, the geometry is too coarse to align a camera to."""
     until: float = 1.0 / 3.0
@@ -58,6 +56,8 @@ class Poses:
         if self._gauge.excluded != excluded:
             self._gauge = _Gauge(self._times, set(excluded), self.values.device)
         gauge = self._gauge
+        # A correction moves the world as one camera sees it, so the mean of all would move the world itself. Without
+        # the mean, Gaussians stay in the solve's frame.
         self.values -= self.values[gauge.keep].mean(0)
         if not excluded:
             return
@@ -89,9 +89,9 @@ class _Gauge:
         self.share = from_numpy(share.astype(np.float32)[:, None]).to(device)
 
 
+# Number of halvings of a twist before the series (scaling and squaring): 1 radian becomes 1/16, for which 6 terms reach
+# float32 accuracy.
 _HALVED = 4
-"""Number of halvings of a twist before the series (scaling and squaring): 1 radian becomes 1/16, for which 6 terms
-reach float32 accuracy."""
 
 
 def _exponential(twist: Tensor) -> Tensor:

@@ -35,8 +35,8 @@ refused = ""
 """Why the self-test forbids recorded steps (set by `device`, for the whole process); empty if they are allowed."""
 _SPARE = 1.5
 """Free memory that a recording needs, as a multiple of a step's peak memory."""
+# Number of recordings that may run out of memory before recording is switched off.
 _TRIES = 4
-"""Number of recordings that may run out of memory before recording is switched off."""
 
 
 class RecordedRun(Protocol):
@@ -98,9 +98,9 @@ class Recorder:
 
     def __init__(self, run: RecordedRun, device: torch.device, recording: Recording | None = None) -> None:
         """`recording`: recording method (default: CUDA graphs)."""
+        # Weak, because the run refers to this recorder: a cycle would keep a finished run's GPU memory until the next
+        # garbage collection.
         self.run: RecordedRun = weakref.proxy(run)
-        """Weak, because the run refers to this recorder. A cycle would keep a finished run's GPU memory until the next
-        garbage collection."""
         self.device = device
         self.recording = recording or CudaGraphs(device)
         self.replayed = 0
@@ -115,10 +115,11 @@ class Recorder:
         self._short = 0
 
     def forget(self) -> None:
-        """Drops all recordings and frees their memory. Single graphs cannot be dropped: they share the cuBLAS workspace
-        of their stream, which is freed with the first graph while others still write to it."""
+        """Drops all recordings and frees their memory."""
         self._layout = ()
         if self._recorded:
+            # All at once: graphs share the cuBLAS workspace of their stream. Freeing one graph would free it while
+            # others still write to it.
             self._recorded.clear()
             self.recording.drop()
 
@@ -239,6 +240,7 @@ class CudaGraphs:
         try:
             with torch.cuda.stream(self._stream):
                 warp_stream(self.device)
+                # In the default mode, CUDA calls of other threads would make the capture fail.
                 graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
                 try:
                     result = work()

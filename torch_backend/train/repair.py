@@ -4,17 +4,12 @@ A step that is not finite changes nothing (`FusedAdam`), and the rasteriser cull
 a repair, however, a NaN in an opacity makes every later step fail, and a Gaussian with a NaN in its position stays
 invisible to every loss. Values are repaired as follows:
 
-- A Gaussian with a parameter that is not finite is dropped. Its neighbours and the next densification fill the hole.
-- A quaternion of zero length, whose Gaussian is culled and gets no gradient, is set to the identity.
-- A host's parameter per Gaussian is set to its initial value.
-- A parameter of the field is set to its last stored finite value. If there is none, it is set to the median of its
-  tensor: near 0 for weights, the neutral 1 for time planes, a typical radius for radii.
-- A parameter of the exposure or the poses is set to 0, which is no correction.
-- A field that displaces many Gaussians too far is restored as a whole, at half the learning rates. Gaussians outside
-  the image get no gradient that would bring them back.
-- Gaussians that a stable field displaces too far are dropped at every round of densification. The field moves them out
-  of view except in the few frames that they fit. In a long run, they would reach the tenth at which the field is
-  restored, again and again.
+- A Gaussian with a parameter that is not finite is dropped.
+- A quaternion of zero length is set to the identity, and a host's parameter per Gaussian to its initial value.
+- A parameter of the field is set to its last stored finite value, or to the median of its tensor.
+- A parameter of the exposure or the poses is set to 0.
+- A field that displaces many Gaussians too far is restored as a whole, at half the learning rates.
+- Gaussians that a stable field displaces too far are dropped at every round of densification.
 - Adam's moments are set to 0 where a value was repaired, and where they are not finite.
 
 If a repair would leave less than half of the Gaussians, the run ends with an error.
@@ -39,17 +34,17 @@ from .adam import all_finite
 from .model import DynamicModel
 from .movers import MOMENTS
 
+# Largest share of Gaussians with a gradient that is not finite for which the Gaussians are dropped. A larger share
+# indicates a fault of the frame or the field.
 _FEW = 0.01
-"""Largest share of Gaussians with a gradient that is not finite for which the Gaussians are dropped. A larger share
-indicates a fault of the frame or the field."""
 _MAX_TOO_FAR = 0.1
 """Largest share of the moving Gaussians that a stable field may displace too far at any time."""
+# A Gaussian is displaced too far if it moves by more than 6 times the moving Gaussians' median distance from their
+# median position. This bound is at least 1 scene unit and at most the scene's extent. A person may walk across the
+# whole moving region, and an apple may swing by many times its size. In a stable preview run, the 90 % quantile of the
+# displacement is at most 0.05 of that distance; in an unstable run, it was hundreds of times as large at some times.
+# The scene's extent alone, which includes far background, did not detect that run (docs/decisions.md).
 _FAR, _LEAST_FAR = 6.0, 1.0
-"""A Gaussian is displaced too far if it moves by more than 6 times the moving Gaussians' median distance from their
-median position. This bound is at least 1 scene unit and at most the scene's extent. A person may walk across the whole
-moving region, and an apple may swing by many times its size. In a stable preview run, the 90 % quantile of the
-displacement is at most 0.05 of that distance; in an unstable run, it was hundreds of times as large at some times. The
-scene's extent alone, which includes far background, did not detect that run (docs/decisions.md)."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _STATE = "memory."
 """Prefix of the tensors of `FieldMemory` in a checkpoint."""
@@ -136,8 +131,8 @@ class FieldMemory:
     def restore_stable(self, field: Deformation, optimizer: torch.optim.Optimizer) -> str:
         """Restores the field if it displaced too many Gaussians too far at any step since the last inspection.
 
-        The older of the two copies is restored, because the newer one may already be unstable. Halves the learning
-        rates of the field's parameters. Returns a description for the user; empty if nothing was done.
+        Halves the learning rates of the field's parameters. Returns a description for the user; empty if nothing was
+        done.
         """
         if not self._kept:
             return ""
@@ -145,9 +140,11 @@ class FieldMemory:
         self._worst.zero_()
         if not worst > _MAX_TOO_FAR:
             return ""
+        # The older copy, because the newer one may already be unstable.
         named, before = dict(field.named_parameters()), self._kept[0]
         if {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in before.items()}:
             return ""
+        # Gaussians outside the image get no gradient that would bring them back, so the whole field is restored.
         self.rates *= 0.5
         for name, p in named.items():
             p.copy_(before[name])
@@ -179,6 +176,8 @@ def repair(
         if bool(bad.any()):
             sound = p[~bad]
             messages.append(f"repaired {_counted(int(bad.sum()), 'number')} of {name}")
+            # Without a stored value, the median: near 0 for weights, the neutral 1 for time planes, a typical radius
+            # for radii.
             _mend(p, bad, before if before is not None else sound.median() if len(sound) else 0.0, optimizer)
     known = {id(p) for p in (*model.gaussians.params.values(), *named.values())}
     for group in optimizer.param_groups:
@@ -186,7 +185,7 @@ def repair(
             bad = ~torch.isfinite(p)
             name = "exposure" if p is model.exposure.values else "the poses"
             messages.append(f"repaired {_counted(int(bad.sum()), 'number')} of {name}")
-            _mend(p, bad, 0.0, optimizer)
+            _mend(p, bad, 0.0, optimizer)  # 0 is no correction
     count = sum(_clear_moments(optimizer, p) for group in optimizer.param_groups for p in group["params"])
     if count:
         messages.append(f"cleared {_counted(count, 'moment')} of Adam")
@@ -218,6 +217,9 @@ def drop_displaced(
     for n in evenly_spaced(len(model.centres), MOMENTS):
         deltas = model.deltas(rows, model.centres[n : n + 1]) if len(rows) else None
         if deltas is not None:
+            # The field moves them out of view except in the few frames that they fit. In a long run they came to a
+            # tenth of all, and the field was restored again and again: `final` of `kitchen` 30.55 to 31.28 dB without
+            # them.
             dropped[rows] |= memory.is_too_far(deltas.means)
     count = int(dropped.sum())
     if count:
@@ -247,9 +249,11 @@ def _repair_gaussians(
     if 2 * count > len(dropped):
         raise unstable(step)
     if count:
+        # Neighbours and the next densification fill the hole.
         messages.append(f"dropped {_counted(count, 'Gaussian')} ({_names(names)} not finite)")
         _drop(model, optimizer, densifier, dropped)
         params = model.gaussians.params
+    # The rasteriser culls a Gaussian whose quaternion has no length, so no gradient would repair it.
     flat = params["quats"].abs().amax(1) <= QUAT_MIN
     if bool(flat.any()):
         messages.append(f"repaired {_counted(int(flat.sum()), 'Gaussian')} (quats without length)")

@@ -62,12 +62,9 @@ def signed_residual(run: RunView, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def likely_movers(residual: Tensor, weight: Tensor) -> Tensor:
-    """Indices of the tenth of the M Gaussians (at least 64) whose residual [I, M] correlates most two frames apart.
-
-    Noise does not correlate. The mean residual over the frames, which is that of badly fitted static surfaces, is
-    subtracted.
-    """
+    """Indices of the tenth of the M Gaussians (at least 64) whose residual [I, M] correlates most two frames apart."""
     seen = (weight > 0.5).float()
+    # Noise does not correlate. Badly fitted static surfaces do, and are removed with the mean over the frames.
     value = (residual - (residual * seen).sum(0) / seen.sum(0).clamp_min(1.0)) * seen
     pairs = (seen[2:] * seen[:-2]).sum(0)
     correlation = torch.where(pairs >= 4, (value[2:] * value[:-2]).sum(0) / pairs.clamp_min(1.0), -torch.inf)
@@ -79,7 +76,7 @@ def correlation_frames(residual: Tensor, weight: Tensor) -> float | None:
 
     The correlation is pooled over the residual [I, M] of M Gaussians in I frames, where weight [I, M] > 0.5. For an
     oscillation of period P, the lag is near P / 6: linear interpolation between nodes at this distance misses at most
-    14 % of the amplitude. None if neighbouring frames do not correlate: then as many nodes as possible are useful.
+    14 % of the amplitude. None if neighbouring frames do not correlate.
     """
     seen = (weight > 0.5).double()
     mean = (residual.double() * seen).sum(0) / seen.sum(0).clamp_min(1.0)
@@ -91,7 +88,7 @@ def correlation_frames(residual: Tensor, weight: Tensor) -> float | None:
         return float((value[later] * value[earlier]).sum()) / pairs if pairs else None
 
     variance, first = agreement(0), agreement(1)
-    if not variance or first is None or first < 0.1 * variance:
+    if not variance or first is None or first < 0.1 * variance:  # too fast: use as many nodes as possible
         return None
     before = first
     for lag in range(2, max(3, len(value) // 2 + 1)):

@@ -48,8 +48,8 @@ from .resume import restore_run, save_run
 from .trainer import Trainer
 from .verdict import warn_if_poor
 
+# Bytes of a field with its moments, and of a run's small tensors (a preview's HexPlane has 4.4 MB).
 _FIELD_BYTES = 14e6
-"""Bytes of a field with its moments, and of a run's small tensors (a preview's HexPlane has 4.4 MB)."""
 
 
 @dataclass(frozen=True)
@@ -164,6 +164,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         restore_run(trainer, checkpoint)
         trainer.extend(params.extend, before["heldout_psnr_db"])
     summary = prepared.trained(shot, params.run, folder, extension, trainer.iteration)
+    # In this order: after a kill in between, the next call only writes what is missing.
     save_run(trainer, checkpoint)
     write_json(folder / SUMMARY_FILE, summary)
     remove_file(extension)

@@ -1,9 +1,8 @@
 """Self-test of a GPU. It compares a small frame with gradients, a loss, Adam steps and the field's planes with the CPU.
 
-It runs in a separate process (`python -m torch_backend doctor --gpu`), because a faulty kernel leaves the CUDA context
-of its process unusable, and because a driver may hang. The result is stored beside Warp's compiled kernels, for one
-driver, GPU and versions of this package, Warp and torch, so the test runs once and again after an update. A failure is
-stored only if two consecutive tests fail in the same way, since one may have been killed, or met a full disk.
+It runs in a separate process (`python -m torch_backend doctor --gpu`). The result is stored beside Warp's compiled
+kernels, for one driver, GPU and versions of this package, Warp and torch, so the test runs once and again after an
+update. A failure is stored only if two consecutive tests fail in the same way.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ from .losses import photometric
 from .recorder import CudaGraphs
 
 SELF_TEST_VERSION = 4
+# Timeout in seconds. Without a cache, the kernels take tens of seconds to compile.
 _SECONDS = 240.0
-"""Timeout in seconds. Without a cache, the kernels take tens of seconds to compile."""
 _GAUSSIANS, _WIDTH, _HEIGHT = 300, 64, 48
+# Largest share of pixels that may differ by more than `_PIXEL`: rounding can move a hit across the alpha threshold.
 _FLIPPED = 0.01
-"""Largest share of pixels that may differ by more than `_PIXEL`: rounding can move a hit across the alpha threshold."""
 _PIXEL = 3e-4
+# Largest relative L2 error of a gradient, including hits that cross the alpha threshold (1e-4 to 4e-3 on fibers).
 _GRADIENT = 2e-2
-"""Largest relative L2 error of a gradient, including hits that cross the alpha threshold (1e-4 to 4e-3 on fibers)."""
 _CTRL_C_EXIT = 0xC000013A
 """Windows exit code of a process that was ended by Ctrl-C or by closing its console."""
 _NO_NUMBER = 1e9
@@ -143,6 +142,7 @@ def card_verdict(folder: Path | None = None, test: Callable[[str], SelfTest] | N
     if found is None or found.key != key:
         test = test or run_in_child
         first = found = test(key)
+        # A single failure may come from a killed process or a full disk.
         if first.lasting and first.failed:
             found = test(key)
         keep(found, place.parent, confirmed=found.failed == first.failed)
@@ -177,6 +177,7 @@ def _kept(place: Path) -> SelfTest | None:
 
 def run_in_child(key: str) -> SelfTest:
     """Runs the self-test in a child process."""
+    # In a child: a faulty kernel leaves the CUDA context of its process unusable, and a driver may hang.
     command = python_child(sys.executable, "torch_backend", "doctor", "--gpu")
     root = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join(part for part in (root, os.environ.get("PYTHONPATH", "")) if part)

@@ -2,8 +2,7 @@
 
 If a hand's true position is farther from its Gaussians than their width, no gradient pulls them there, and they stay at
 the most frequent position. At low resolution, both positions overlap. Still pixels are always trained at full
-resolution, and so are all pixels before a field exists: a run that started with low-resolution images lost 0.2 to
-0.9 dB in still regions (docs/decisions.md, "Gate and field").
+resolution, and so are all pixels before a field exists.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from .losses import photometric
 
 _LENGTHS_OF = 640.0
 """Image width in pixels to which lengths refer."""
+# Width of the margin around moving pixels that is included, in pixels of an image 640 wide.
 _MARGIN = 4.0
-"""Width of the margin around moving pixels that is included, in pixels of an image 640 wide."""
 
 
 class SoftenedMovers:
@@ -44,6 +43,7 @@ class SoftenedMovers:
     def movers_at(self, frame: int, progress: float) -> Tensor | None:
         """bool [H, W] moving pixels of the training frame at position `frame`; None if they have full resolution at
         `progress` (share of the run)."""
+        # Not before the field exists: runs that began at low resolution lost 0.2 to 0.9 dB in still regions.
         is_active = self.movers is not None and self.span[0] <= progress < self.span[1] and self._any[frame] > 0
         return self.movers[frame] if is_active and self.movers is not None else None
 
@@ -62,6 +62,7 @@ class SoftenedMovers:
             return photometric(image, target, dssim, ignored)
         moves = F.max_pool2d(movers[None, None].float(), 2 * self.margin + 1, 1, self.margin)[0, 0] > 0.0
         taught = moves if ignored is None else moves & ~ignored
+        # Both terms are means over the whole image, so moving and still regions keep their shares of the loss.
         sharp = photometric(image, target, dssim, moves if ignored is None else moves | ignored)
         return sharp + photometric(self._soft(image), self._soft(target), dssim, ~self._touched(taught))
 

@@ -62,6 +62,7 @@ class Soundness:
         (`recorder`), so that the next inspection finds the gradients of a step."""
         self._in_a_row = 0
         self._counted = torch.zeros(2, dtype=torch.int32, device=device)
+        # Twice, because a step of the paper's rule uses two frames.
         self._recent: deque[int] = deque(maxlen=2 * INSPECT_EVERY)
 
     def trains_on(self, *frames: int) -> None:

@@ -6,11 +6,8 @@ frames. Decisions are deterministic and their state is stored in the checkpoint,
 
 - SH degree: a higher degree is kept if it improves PSNR over the same model truncated to the degree below. At that
   time the new coefficients are only partly trained; `lasting` extrapolates their gain to the end of the run.
-- Growth: PSNR also rises by optimisation alone, and the two effects cannot be measured separately in one run. So
-  growth is judged by an upper bound, the total gain while the Gaussians grew. Growth ends when this gain falls below
-  a threshold per 10 % more Gaussians. The bound favours growth.
-- End: the run stops when the probes gain nothing more. By then they are trained on, so their gain is at least that of
-  held-out frames. This favours a longer run.
+- Growth: ends when the total gain while the Gaussians grew falls below a threshold per 10 % more Gaussians.
+- End: the run stops when the probes gain nothing more.
 - Time nodes: chosen from the time over which the residual of the static model stays correlated
   (`residual.correlation_frames`).
 
@@ -34,9 +31,9 @@ _MIN_GROWTH = 1.5
 """Least growth factor of the number of Gaussians over the measurements by which growth is judged."""
 _POINTS = 4
 """Least number of measurements by which growth is judged."""
+# Least span of these measurements, as a share of the run. In a long run, the schedule doubles the Gaussians in three
+# rounds of densification; judged over three rounds only, growth ended at 42,000 of 160,000.
 _SPAN = 0.1
-"""Least span of these measurements, as a share of the run. In a long run, the schedule doubles the Gaussians in three
-rounds of densification; judged over three rounds only, growth ended at 42,000 of 160,000."""
 
 
 @dataclass
@@ -333,9 +330,12 @@ class StoppingPolicy:
         if value is None:
             return
         self.measured.append((probe.iteration, probe.gaussian_count, value))
-        # A new field disturbs the probes' PSNR during the trial. A measurement 3 steps after its creation ended growth.
+        # A new field disturbs the probes' PSNR during the trial. A measurement 3 steps after its creation ended growth,
+        # and a fifth of the Gaussians of `hall` were never made.
         if not self.joined and self.growing and not self.facts.on_trial:
             gain = self.facts.growth_gain_db = growth_gain(self.measured, round(_SPAN * self.schedule.iterations))
+            # An upper bound, which favours growth: one run cannot separate the gain by growth from that by
+            # optimisation.
             if gain is not None and gain < self.config.growth_gain:
                 self.growth_ended = probe.iteration
         s = self.schedule
@@ -344,7 +344,10 @@ class StoppingPolicy:
         sharp = s.softened + self.config.stop_window if s.softened > 0.0 else 0.0
         over = probe.progress > max(hardened, sharp, s.densify_stop if self.growing else 0.0)
         gain = newest_gain(self.measured, probe.iteration - round(self.config.stop_window * s.iterations))
+        # With fewer steps left than the annealing takes, stopping would save nothing.
         early = probe.iteration + self._anneal < s.iterations
+        # The probes are trained on by then, so they gain at least as much as held-out frames. This favours a longer
+        # run.
         if over and early and gain is not None and gain < self.config.stop_gain:
             self.stopped = probe.iteration
 

@@ -53,8 +53,7 @@ from .stopping import RunSchedule, StoppingPolicy
 class Trainer:
     """Optimises one run on one device.
 
-    Random numbers are always drawn on the CPU, so that a run is the same experiment on every device and its checkpoint
-    can be resumed on any. On a GPU a step reads nothing back; the loop checks the state every `INSPECT_EVERY` steps.
+    On a GPU a step reads nothing back; the loop checks the state every `INSPECT_EVERY` steps.
 
     Args:
         scene: normalised scene, on the CPU.
@@ -90,6 +89,7 @@ class Trainer:
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
         self.times = [float(scene.times[i]) for i in train]
         self.seconds = float(scene.seconds[train[-1]] - scene.seconds[train[0]])
+        # Drawn on the CPU for every device: a run is the same experiment, and its checkpoint resumes on any.
         self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
         centres = bin_times(scene.times[train])
         self._bins = [bin_of(centres, time) for time in self.times]
@@ -163,9 +163,9 @@ class Trainer:
         self.policy.joined = True  # the probe frames of a run that ended early may still be excluded
 
     def densify_config(self) -> DensifyConfig:
-        """The densification settings, with the budget limited to `most`. `config` itself is not changed, since the
-        run's key is computed from it."""
+        """The densification settings, with the budget limited to `most`."""
         config = self.config.densify
+        # A copy, because the run's key is computed from `config`.
         return config if self.most is None else dataclasses.replace(config, budget=min(config.budget, self.most))
 
     def step(self) -> Tensor:
@@ -228,6 +228,7 @@ class Trainer:
         deltas, anchored = self._deltas(rows, facts.field_time, pairs)
         if deltas is not None:
             self.soundness.memory.observe(deltas.means.detach())
+        # As published for SC-GS: until 13/80 of a run, the photometric loss does not train the field.
         if deltas is not None and kind.detached:
             deltas = deltas.detached()
         state = model.moved(rows, deltas)
@@ -238,6 +239,7 @@ class Trainer:
         )  # fmt: skip
         paper = kind.moves and supervision.is_paper_step(self.iteration, self.progress)
         if paper:
+            # The paper's detectors read this gradient after the backward pass; torch would free it.
             state["means"].retain_grad()
         exposed = model.exposure.apply_at(out.colors[0], facts.exposure_bins, facts.exposure_shares)
         loss = self.softened.loss(exposed, facts.image, self.config.dssim, facts.ignored, facts.movers)
@@ -261,6 +263,7 @@ class Trainer:
         if self._refines_poses():
             self.poses.fix_gauge(self.excluded_frames)
         applied = self.optimizer.applied
+        # Only on the CPU: on a GPU, reading `applied` would wait for the step.
         if self.device.type == "cpu" and not bool(applied):
             self.soundness.skipped(self, frame)
             return loss.detach()
@@ -276,6 +279,7 @@ class Trainer:
             raise RuntimeError("the frame was rendered without contributions")
         radii, weight = out.radii[0], out.weight_sum[0]
         if self.device.type != "cpu":
+            # A skipped step must not count as a view of the Gaussians. The product needs no read-back.
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
         mark_seen(self.model.gaussians, facts.time_bin, weight)
@@ -312,6 +316,7 @@ class Trainer:
         means = self.model.gaussians.params["means"]
         # Anchors train the field only: without `detach`, gradients through the field would also move the means.
         positions = torch.cat([means[rows], means.detach()[pairs.rows]])
+        # At one time, a node's motion is computed once. A joint call of mixed times would compute it for each pair.
         if field.has_separate_calls and self.device.type != "cpu":
             anchored = field(positions[len(rows) :], times[len(rows) :], self.model.gaussians.host_params(pairs.rows))
             return self.model.deltas(rows, time), anchored
@@ -381,6 +386,7 @@ class Trainer:
         if field is None or not len(rows):
             return total
         if penalised:
+            # Times the interval of these steps.
             total = total + c.field_every * field.regularisation(self.progress, self.generator)
         return total
 
@@ -389,7 +395,7 @@ class Trainer:
         if field is None:
             raise RuntimeError("pairs were drawn without a field")
         loss = support_loss(self.model.gaussians, field, pairs, deltas, self.centres, self.seconds, s)
-        return s.support_every * loss
+        return s.support_every * loss  # times the interval of these steps
 
     def inspect_nonfinite(self) -> None:
         """Repairs parameters that are not finite, and warns. JobError if the run keeps failing."""
