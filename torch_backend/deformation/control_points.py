@@ -50,8 +50,8 @@ _WINDOW = 0.05
 """ARAP: largest distance of the two times, in normalised time."""
 _SURROGATES = 16
 """Pre-training: maximum number of surrogate points per node."""
+# Pre-training: opacity below which surrogates are pruned.
 _PRUNED = 0.005
-"""Pre-training: opacity below which surrogates are pruned."""
 _INSTANTS = 16
 """Number of times at which a trajectory is sampled."""
 
@@ -368,9 +368,7 @@ def _radii(places: Tensor, published: bool) -> Tensor:
 class _Surrogates:
     """Surrogate balls of one common size and SH degree 0, which are trained to find the motion for the nodes.
 
-    As published, they are split at every hundredth of the stage (at least every 10 steps, so that several frames
-    contribute to the decision) from a twentieth on. The published threshold is on screen gradients, which this stage
-    does not have. Instead, a schedule splits those with the largest gradients, up to 16 per node.
+    As published, they are split at every hundredth of the stage from a twentieth on; up to 16 per node.
     """
 
     def __init__(self, field: ControlPoints, stage: Rehearsal) -> None:
@@ -396,6 +394,7 @@ class _Surrogates:
         """Runs all steps, then sets the field's nodes."""
         stage, field = self.stage, self.field
         warm, sampling = round(0.2 * stage.steps), round(0.75 * stage.steps)
+        # At least 10 steps, so that several frames contribute to a decision.
         first, every = round(0.05 * stage.steps), max(10, round(0.01 * stage.steps))
         for step in range(stage.steps):
             if first < step < sampling and step % every == 0:
@@ -458,6 +457,7 @@ class _Surrogates:
             if bool(is_visible.any())
             else torch.arange(len(is_visible), device=is_visible.device)
         )
+        # By schedule, because the published threshold is on screen gradients, which this stage does not have.
         more = min(len(kept), max(0, self.limit - len(kept)) // rounds)
         parents = kept[self.pull[kept].topk(more).indices]
         spread = torch.randn(more, 3, generator=self.stage.generator, device="cpu").to(parents.device)

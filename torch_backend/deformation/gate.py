@@ -6,7 +6,7 @@ mattes are opened on trial; without mattes, all Gaussians that contribute. Durin
 Closed Gaussians do not use the field, so they cost nothing, do not drift and need no anchors.
 
 The error of the static model is not a good criterion: it is as large on surfaces that are hard to fit as on moving
-objects (figures in docs/architecture.md). Motion that is worth its price in several consecutive frames is rarely false.
+objects (docs/decisions.md, "Gate and field"). Motion that is worth its price in several frames is rarely false.
 """
 
 from __future__ import annotations
@@ -97,6 +97,7 @@ def change_of(
     """
     moments = list(moments)
     counts = torch.ones(len(moments), len(rows), device=rows.device) if seen is None else seen.float()
+    # Gaussians that no frame shows: all times count.
     counts = torch.where(counts.sum(0) > 0, counts, 1.0)
     shares = counts / counts.sum(0)
     mean = Deltas(*(None if parts[0] is None else _weighted(shares, parts) for parts in zip(*moments, strict=True)))  # type: ignore[arg-type]
@@ -109,6 +110,7 @@ def change_of(
         if at.opacity_logits is not None and mean.opacity_logits is not None:
             now, usual = torch.sigmoid(opacity + at.opacity_logits), torch.sigmoid(opacity + mean.opacity_logits)
             departure = torch.maximum(departure, (now - usual).abs() / config.opacity)
+        # At times without a frame the field is arbitrary, so its change there is no evidence.
         change = torch.maximum(change, torch.where(counted > 0, departure, 0.0))
     return change, mean
 
@@ -132,7 +134,9 @@ def stays_open(
     means = model.params["means"].detach()[rows].cpu().numpy()
     index = nearest_points(means, means, config.neighbours + 1)[1]
     nearest = from_numpy(np.ascontiguousarray(index)).to(rows.device)
+    # Neighbours do not share their noise, so a median over them keeps motion and removes noise.
     smooth = change[nearest].median(1).values
+    # Errors of solved cameras move everything a little. Still Gaussians, the lowest quarter, measure how much.
     stays = smooth > max(1.0, noise * float(change.quantile(0.25)))
     room = int(config.max_share * len(model))
     if int(stays.sum()) > room:

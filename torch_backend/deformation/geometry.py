@@ -13,8 +13,8 @@ from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet
 from ..torch_types import cross, determinant, norm, singular_values, split
 
+# Squared angle below which quotients of sin and cos are computed by series. Closed forms lose precision in float32.
 _SERIES = 0.25
-"""Squared angle below which quotients of sin and cos are computed by series. Closed forms lose precision in float32."""
 
 
 def quat_product(a: Tensor, b: Tensor) -> Tensor:
@@ -76,6 +76,7 @@ def farthest_points(features: Tensor, count: int) -> Tensor:
     Starts at the feature nearest to the mean. Stops early if only duplicates are left.
     """
     picked = [int((features - features.mean(0)).square().sum(1).argmin())]
+    # By differences: matrix products would leave duplicates at small non-zero distances.
     distance = torch.cdist(features, features[picked], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
     while len(picked) < min(count, len(features)):
         index = int(distance.argmax())
@@ -113,6 +114,7 @@ def nearest(queries: Tensor, points: Tensor, count: int) -> Tensor:
     Uses compiled code on the CPU, which returns the first points for queries that are NaN.
     """
     if queries.device.type == "cpu" and queries.dtype == torch.float32 and count <= min(_MOST, len(points)):
+        # The kernel reads 16 points at once. Padded ones are so far away that none is ever nearest.
         padded = F.pad(points.float().t(), (0, -len(points) % 16), value=1e18).contiguous()
         queries, index = queries.contiguous(), torch.empty(len(queries), count, dtype=torch.long, device="cpu")
         _search().run(
@@ -141,5 +143,6 @@ def rigid_rotations(before: Tensor, after: Tensor, valid: Tensor) -> tuple[Tenso
         eye = torch.eye(3, dtype=before.dtype, device=before.device)
         u, _, vh = singular_values(torch.where(usable[:, None, None], covariance, eye))
         flip = torch.ones_like(u[:, 0])
+        # Without this sign, mirrored edges would give a reflection (Kabsch).
         flip[:, 2] = determinant(u @ vh).sign()
         return torch.where(usable[:, None, None], (u * flip[:, None, :]) @ vh, eye), usable

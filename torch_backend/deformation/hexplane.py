@@ -1,11 +1,9 @@
 """Host A: a HexPlane field and five heads (4DGaussians; figures and differences in docs/architecture.md).
 
-Changes to the published code: Time is mapped to the whole plane. The heads' last layers start at zero, so that the
-field starts as the identity. Learning rates do not depend on the scene's extent, because the scene is normalised.
-Smoothness acts along both axes of a spatial plane. The activation is SiLU: with ReLU, the whole trunk often dies in the
-first steps, and the field stays constant. Sampling coordinates are detached, so that no gradient reaches the means
-through the field. Axes are stretched around the Gaussians: background behind a mover makes the box large, so that
-people would be only a few nodes wide. `published` reverts all of these changes.
+Changes to the published code: Time is mapped to the whole plane. The heads' last layers start at zero. Learning rates
+do not depend on the scene's extent, because the scene is normalised. Smoothness acts along both axes of a spatial
+plane. The activation is SiLU. Sampling coordinates are detached. Axes are stretched around the Gaussians. `published`
+reverts all of these changes.
 
 The trainer implements the following for every host, which differs from the published code: one image per step (2 to 4),
 the loss, learning rates and densification of the Gaussians, and one optimiser for both stages.
@@ -28,8 +26,8 @@ from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_sca
 
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
 PUBLISHED_ITERATIONS = 33_000
+# Scene extent (1.1 camera extents) by which the published code multiplies its rates. Our camera extent is 1.
 _EXTENT = 1.1
-"""Scene extent (1.1 camera extents) by which the published code multiplies its rates. Our camera extent is 1."""
 _WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "sh0": 3}
 
 
@@ -158,6 +156,7 @@ class HexPlane(Deformation):
         self.hidden = nn.ModuleDict({name: _linear(config.width, config.width, generator) for name in widths})
         self.out = nn.ModuleDict({n: nn.Linear(config.width, size, device="cpu") for n, size in widths.items()})
         self._cached: _InOrder | None = None
+        # At zero, the field starts as the identity.
         for head in self.out.values():
             if config.published:
                 nn.init.xavier_uniform_(head.weight, generator=generator)  # type: ignore[arg-type]
@@ -167,9 +166,11 @@ class HexPlane(Deformation):
 
     def features_at(self, means: Tensor, times: Tensor) -> Tensor:
         """[M, features * levels] products of the samples of six planes, concatenated over levels."""
+        # Detached, so that no gradient moves the means through the sampling of the planes.
         means = means if self.config.published else means.detach()
         low, high = self._rim
         positions = 2.0 * (self._stretched(means) - low) / (high - low) - 1.0
+        # The published code samples [-1, 1] at times in [0, 1], and so uses half of each time plane.
         plane_times = (times if self.config.published else 2.0 * times - 1.0).expand(len(means))
         planes = self._by_level()
         if compiled.supports(planes) and positions.dtype == torch.float32:
@@ -186,6 +187,7 @@ class HexPlane(Deformation):
 
     def _stretched(self, places: Tensor) -> Tensor:
         """Positions [P, 3] in the stretched coordinates in which the planes' nodes are evenly spaced."""
+        # Background behind a mover makes the box large: evenly spaced nodes would leave a person a few nodes wide.
         return places if self.around is None else torch.asinh((places - self.around[0]) / self.around[1])
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -215,6 +217,7 @@ class HexPlane(Deformation):
         _, trunk, heads = self._in_order()
         if self.config.silu and network.supports(features, trunk, heads):
             return network.network(features, trunk, heads)
+        # With ReLU, the whole trunk often dies in the first steps, and the field stays constant.
         bent = F.silu if self.config.silu else F.relu
         hidden = bent(F.linear(features, *trunk))
         return tuple(F.linear(bent(F.linear(hidden, *first)), *last) for first, last in heads)
@@ -224,7 +227,8 @@ class HexPlane(Deformation):
         return self._in_order().planes
 
     def _in_order(self) -> _InOrder:
-        """Cached parameter lists. Lookups by name in torch's lists took 1/15 of the CPU time of a step on a GPU."""
+        """Cached parameter lists."""
+        # Lookups by name in torch's lists took 1/15 of the CPU time of a step on a GPU.
         if self._cached is None or self._cached.trunk.weight is not self.trunk.weight:
             levels = range(0, len(self.spatial), 3)
             self._cached = _InOrder(

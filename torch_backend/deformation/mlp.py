@@ -167,6 +167,7 @@ class Mlp(Deformation):
 
     def forward(self, means: Tensor, times: Tensor, host_params: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] in scene units (detached), times [M] or [1] in [0, 1]."""
+        # Detached, so that no gradient moves the means through the encoding.
         positions = means.detach()
         if not self.config.published:
             positions = 2.0 * (positions - self.box[0]) / (self.box[1] - self.box[0]) - 1.0

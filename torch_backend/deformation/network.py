@@ -1,10 +1,9 @@
 """Compiled CPU implementation of the HexPlane's network (a trunk and two-layer heads) and its gradients.
 
 The torch path in `hexplane` is the specification, and is used for other devices and types. It stores every layer of all
-Gaussians before and after activation, some hundred floats each, and reads them in the backward pass. With many
-Gaussians, memory traffic dominates. This implementation sends tiles of a few dozen Gaussians through the whole network,
-stores only the outputs, and recomputes the layers in the backward pass. Weight gradients are summed over fixed shares
-of the Gaussians, so that results are bit-identical for any number of threads.
+Gaussians before and after activation, some hundred floats each, and reads them in the backward pass. This
+implementation sends tiles of a few dozen Gaussians through the whole network, stores only the outputs, and recomputes
+the layers in the backward pass. Results are bit-identical for any number of threads.
 """
 
 from __future__ import annotations
@@ -135,8 +134,11 @@ class _Network(torch.autograd.Function):
     def backward(ctx: _Through, *grads: Tensor) -> tuple[Tensor | None, ...]:
         saved: tuple[Tensor, ...] = ctx.saved_tensors
         features, *params = saved
+        # Layers are computed again here: storing them would cost some hundred floats per Gaussian, and memory traffic
+        # dominates.
         packed, count = _packed(params), len(features)
         pulls = [grad.contiguous() for grad in grads]
+        # Shares depend on the number of Gaussians only, so the sums are bit-identical for any number of threads.
         rows = max(_LEAST, -(-count // (_UNITS * _TILE)) * _TILE)
         units = -(-count // rows)
         sizes = _sizes(packed)

@@ -2,9 +2,7 @@
 
 The torch path in `hexplane` launches six samplers and their products per level, and as many backward kernels. Here, one
 launch samples and multiplies all planes of all levels. A second launch computes the gradients of all planes, and a
-third those of the points, if needed. One launch computes the penalty of all planes with its gradient. Samples are
-recomputed in the backward pass: storing six samples per level would take as much memory as the SH coefficients of a
-Gaussian, and the planes fit the GPU's cache.
+third those of the points, if needed. One launch computes the penalty of all planes with its gradient.
 
 Plane gradients are summed by atomics, so their last bits depend on the order of execution, as in the rasteriser. All
 other results are deterministic. Any number of features is supported. Tests run the same kernels on Warp's CPU device,
@@ -123,6 +121,8 @@ class _Product(torch.autograd.Function):
         width = 4 if channels % 4 == 0 else 1
         inputs = [_table(planes).data_ptr(), positions.data_ptr(), 0, features.data_ptr(), levels]
         launch_on(kernels(channels).samples, features.numel() // width, inputs, positions.device)
+        # Samples are computed again in the backward pass. Six per level would take as much memory as a Gaussian's SH
+        # coefficients, and the planes fit the GPU's cache.
         ctx.save_for_backward(positions, *planes)
         return features
 

@@ -57,10 +57,8 @@ MIN_SCALE = 1e-5
 
 
 def add_to_scale(log_scales: Tensor, delta: Tensor) -> Tensor:
-    """log(exp(log_scales) + delta), the published rule of Deformable 3DGS and SC-GS.
-
-    The sum can be negative; it is clamped to at least MIN_SCALE, without gradient below.
-    """
+    """log(exp(log_scales) + delta), at least log(MIN_SCALE), the published rule of Deformable 3DGS and SC-GS."""
+    # The sum can be negative, which has no logarithm.
     return (log_scales.exp() + delta).clamp_min(MIN_SCALE).log()
 
 
@@ -217,6 +215,7 @@ class HostSpec:
 
 def field_box(means: Tensor) -> Tensor:
     """Bounds [2, 3] that a field should resolve for means [M, 3]: 1 % and 99 % quantiles with a margin."""
+    # A few background Gaussians would enlarge the box, while most open ones are near.
     low, high = np.quantile(means.cpu().numpy(), (0.01, 0.99), axis=0)
     low, high = (torch.as_tensor(bound, dtype=torch.float32, device=means.device) for bound in (low, high))
     margin = 0.15 * (high - low).clamp_min(1e-2)
@@ -224,11 +223,9 @@ def field_box(means: Tensor) -> Tensor:
 
 
 def rate_scale(published: int, iterations: int) -> float:
-    """Factor of a grid's published learning rates in a shorter run: square root of published / iterations, at least 1.
-
-    Adam changes a parameter by about the learning rate per step. With the rates of a long run, a grid would change too
-    little in a short run, and a comparison would favour our configuration.
-    """
+    """Factor of a grid's published learning rates in a shorter run: the root of published / iterations, at least 1."""
+    # Adam changes a parameter by about the learning rate per step. Unscaled, a grid would change too little in a short
+    # run, and a comparison would favour our configuration.
     return max(1.0, published / iterations) ** 0.5
 
 

@@ -91,12 +91,11 @@ class SupervisionConfig:
         return self.preset == "paper" and progress >= self.start and iteration % self.every == 0
 
 
+# Weights of the attributes in `support`, chosen so that typical deltas of all attributes have similar weight. Means are
+# in scene units.
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
-"""Weights of the attributes in `support`, chosen so that typical deltas of all attributes have similar weight. Means
-are in scene units."""
+# Weights of the attributes in `stillness`. Opacity and colour weigh more: they let a Gaussian become another object.
 _STILL_WEIGHTS = {"means": 5.0, "quats": 0.5, "log_scales": 0.5, "opacity_logits": 1.0, "sh0": 1.0, "shN": 0.5}
-"""Weights of the attributes in `stillness`. Opacity and colour weigh more: they let a Gaussian become another
-object."""
 _KNEE = 0.02
 """Below this the support loss is quadratic, above it linear (Charbonnier)."""
 
@@ -145,17 +144,17 @@ def draw(rows: int, bins: int, config: SupervisionConfig, generator: torch.Gener
 
 
 def anchored_pairs(model: Gaussians, rows: Tensor, draws: Draws, config: SupervisionConfig) -> Anchored | None:
-    """Pairs that `draws` select among the open `rows` [M]; None if no pair needs an anchor.
-
-    On a GPU, pairs that need no anchor stay with weight 0. To drop them, the CPU would have to wait for their number.
-    """
+    """Pairs that `draws` select among the open `rows` [M]; None if no pair needs an anchor. On a GPU, pairs that need
+    no anchor stay with weight 0."""
     support = model.support[rows]
+    # A Gaussian in plain view that does not contribute is contradicted by the frame: it faded, or its object left.
     lacking = ~support & model.hidden[rows] if config.anchor == "hidden" else ~support
     picked, bins, valid = _pairs(support, lacking, draws)
     rows = rows[picked]
     if rows.device.type == "cpu":
         rows, bins = rows[valid], bins[valid]
         return Anchored(rows, bins, torch.ones(len(rows), device="cpu")) if len(rows) else None
+    # To drop pairs, the CPU would have to wait for their number.
     return Anchored(rows, bins, valid.float())
 
 
@@ -170,8 +169,6 @@ def support_loss(
 ) -> Tensor:
     """Loss that pulls deltas at unsupported times to deltas interpolated between the nearest supported bins, 0-dim.
 
-    Canonical parameters get no gradient: only the field is trained.
-
     Args:
         deltas: the field's deltas of `pairs`, with gradient.
         centres: [B] normalised times of the bins.
@@ -180,6 +177,7 @@ def support_loss(
     rows, bins = pairs.rows, pairs.bins
     left, has_left, right, has_right = nearest_supported(model.support[rows], bins)
     with torch.no_grad():
+        # Anchors are targets: they get no gradient, and canonical parameters stay.
         means = model.params["means"][rows]
         host_params = model.host_params(torch.cat([rows, rows]))
         anchors = field(torch.cat([means, means]), torch.cat([centres[left], centres[right]]), host_params)
@@ -190,6 +188,7 @@ def support_loss(
         distance = torch.minimum(
             torch.where(has_left, near_left, torch.inf), torch.where(has_right, near_right, torch.inf)
         )
+        # In seconds, so that confidence does not depend on the length of the clip.
         confidence = torch.exp(-distance / config.support_seconds)
     columns, widths = _columns(anchors)
     first, second = columns.reshape(2, len(rows), -1)
@@ -217,12 +216,10 @@ def stillness(deltas: Deltas, count: int, error: Tensor, weight: Tensor, config:
 
     Each time is seen by one camera only. No other frame penalises a delta that overfits this camera's frame, but the
     error is visible when the instant is seen from another view. Motion must therefore improve the image by more than
-    this price. Per Gaussian, the price is the logarithm of an L1 norm: starting to move costs most, moving farther
-    costs little. The sum is divided by the number of all Gaussians, so that it does not depend on how many may move.
+    this price.
 
     Args:
-        error: the frame's photometric loss, 0-dim; it scales the price, because an image that is harder to fit gains
-            more from any motion, also from a false one.
+        error: the frame's photometric loss, 0-dim; it scales the price.
         weight: 0-dim, `still_weight` at the run's progress.
     """
     moved, widths = _columns(deltas)
@@ -232,21 +229,22 @@ def stillness(deltas: Deltas, count: int, error: Tensor, weight: Tensor, config:
     knees = (tuple(config.still_knee * _STILL_WEIGHTS["means"] / _STILL_WEIGHTS[name] for name in names),)
     group, share, knee = (small_table(rows, torch.float32, moved.device) for rows in (member, shares, knees))
     total = ((torch.sqrt(moved.square() @ group + knee.square()) - knee) @ share)[:, 0]
+    # Starting to move costs most, moving farther costs little.
     price = config.still_scale * torch.log1p(total / config.still_scale)
+    # An image that is harder to fit gains more from any motion, also from a false one. Divided by all Gaussians, so
+    # that the price does not depend on how many may move.
     return weight * error.detach() * price.sum() / max(1, count)
 
 
+# Number of pairs with any bin per near pair. Near pairs are used only if too few of the others are valid.
 _FAR = 4
-"""Number of pairs with any bin per near pair. Near pairs are used only if too few of the others are valid."""
 
 
 def _pairs(support: Tensor, lacking: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
     """(row, bin, valid) of the drawn pairs. A pair is valid where `lacking` [M, B] is set, in a row with any `support`
     [M, B]. The number of valid pairs is limited to the number of near pairs.
 
-    The first pairs have any bin; the last (near) pairs have a bin at a log-uniform distance from support. Near pairs
-    pull hardest, also on Gaussians that faded because their object moved away. With weight 1, equal numbers of both
-    kinds trained the bundled clip to 22.96 dB on held-out frames, against 24.39 dB with mostly far pairs.
+    The first pairs have any bin; the last (near) pairs have a bin at a log-uniform distance from support.
     """
     bins, count, picked = support.shape[1], len(draws.start), draws.picked
     # The k-th supported bin of a row is where the running count first exceeds k.
@@ -257,6 +255,8 @@ def _pairs(support: Tensor, lacking: Tensor, draws: Draws) -> tuple[Tensor, Tens
     chosen = chosen.clamp(0, bins - 1)
     at = (picked, chosen)
     valid &= support.any(1)[picked] & lacking[at]
+    # Far pairs come first and fill the limit. Near pairs pull hardest, also on Gaussians whose object left: equal
+    # shares gave 22.96 dB instead of 24.39 (bundled clip, held out).
     return picked, chosen, valid & (valid.cumsum(0) <= count)
 
 
@@ -280,10 +280,6 @@ def well_supervised(
 ) -> Tensor:  # fmt: skip
     """bool [M] Gaussians that an image supervises, by the configured detector. Others in its frustum are *defective*.
 
-    grad_signed adds the components of the screen gradient in NDC, as the published code does, so that about half of the
-    supervised Gaussians fail. The rasteriser returns only the norm of that gradient. Its components are computed from
-    the gradient of the 3D means across the line of sight, to first order in the Gaussian's size over its depth.
-
     Args:
         weight: [M] sum of alpha * T over the image.
         norm: [M] norm of the screen gradient of the image's loss, 1/px.
@@ -296,9 +292,12 @@ def well_supervised(
         return norm > config.defective_gradient
     if config.detector != "grad_signed":
         raise ValueError(f"detector is {config.detector!r}: it should be one of {', '.join(DETECTORS)}")
+    # The rasteriser returns only the norm of the screen gradient. Its components follow from the gradient of the means
+    # across the line of sight, to first order in size over depth.
     across = pull @ viewmat[:3, :3].T
     depth = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
     ndc = [0.5 * size[axis] * across[:, axis] * depth / K[axis, axis] for axis in (0, 1)]
+    # As the published code adds them, with sign: about half of the supervised Gaussians fail.
     return ndc[0] + ndc[1] > config.defective_gradient
 
 
@@ -314,6 +313,7 @@ def paper_loss(first: PaperView, second: PaperView, progress: float, config: Sup
         return None
     phi = math.exp(-config.tau * (late.time - early.time))
     linear = progress >= config.switch
+    # Hidden states are anchored to the past, defective ones to the future (paper, Temporally-Anchored Regularization).
     hidden = ~late.inside & early.inside & early.supervised
     defective = early.inside & ~early.supervised & late.inside & late.supervised
     terms: list[Tensor] = []

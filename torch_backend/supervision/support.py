@@ -14,8 +14,8 @@ from torch import Tensor
 from ..gaussians import Gaussians
 
 MAX_BINS = 256
+# Share of the depth by which a centre must lie behind the visible surface, beyond its own size, to count as hidden.
 _DEPTH_TOLERANCE = 0.02
-"""Share of the depth by which a centre must lie behind the visible surface, beyond its own size, to count as hidden."""
 SEEN_WEIGHT = 0.1
 """Sum of alpha * T over a frame's pixels above which a Gaussian counts as seen in it."""
 
@@ -39,10 +39,10 @@ def bin_of(centres: Tensor, time: float) -> int:
 def mark_seen(model: Gaussians, time_bin: Tensor, weight_sum: Tensor) -> None:
     """Marks the Gaussians that contribute to a training frame; weight_sum [N] is the sum of alpha * T over its pixels.
 
-    time_bin: int64 [1], on the model's device, so that a recorded step (`train.recorder`) can be replayed with another
-        bin.
+    time_bin: int64 [1], on the model's device.
     """
     seen = weight_sum[:, None] > SEEN_WEIGHT
+    # By tensors of indices, so that a recorded step can be replayed with another bin.
     model.support.index_copy_(1, time_bin, model.support.index_select(1, time_bin) | seen)
 
 
@@ -57,9 +57,6 @@ def mark_hidden(
     depth: Tensor,
 ) -> None:
     """Marks the Gaussians of `rows` [M] that a frame cannot show: outside the frame, or behind its surface.
-
-    The frame contradicts a Gaussian that is in plain view but does not contribute: it may have faded, or its object may
-    have moved away. Such a Gaussian is not anchored to where it was seen (`anchors.anchored_pairs`).
 
     Args:
         time_bin: int64 [1], on the model's device.
