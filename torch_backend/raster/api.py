@@ -26,6 +26,7 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, body: s
     _shape("Ks", Ks, (viewmats.shape[0], 3, 3))
     if not 1 <= width <= SIDE_MAX or not 1 <= height <= SIDE_MAX:
         raise ValueError(f"width and height must be 1 to {SIDE_MAX}, not {width} x {height}")
+    # Reading values on a GPU would stall it. There, invalid cameras give an empty image.
     on_host = [value for value in (viewmats, Ks) if body != "cuda" or not value.is_cuda]
     if not all(bool(torch.isfinite(value).all()) for value in on_host):
         raise ValueError("viewmats and Ks must be finite")

@@ -14,14 +14,17 @@ the principal point.
 
 import math
 
+# As in Kerbl et al. 2023, like the two constants below: less than one step of an 8-bit image.
 ALPHA_MIN = 1.0 / 255.0
 """A Gaussian is skipped at a pixel where its alpha is below this."""
 ALPHA_MAX = 0.99
 """Upper clamp of alpha, so that 1 - alpha stays positive."""
 T_STOP = 1e-4
 """(1 - ALPHA_MAX)^2: a pixel is finished once its transmittance is at or below this."""
+# As in 3DGS: it makes every Gaussian at least about one pixel wide.
 LOW_PASS = 0.3
 """Variance in px^2 added to both diagonal entries of every projected covariance."""
+# The affine approximation (EWA) grows without bound off screen, so its position is clamped, as in 3DGS.
 FRUSTUM_MARGIN = 0.3
 """Widening of the frustum for the Jacobian's clamp; the limit of a centred frustum is 1.3 tan(fov / 2)."""
 QUAT_MIN = 1e-6

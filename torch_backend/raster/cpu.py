@@ -17,8 +17,8 @@ from .constants import FRUSTUM_MARGIN, TILE
 from .reference import expected_depth
 from .settings import RasterOutput, Scene, camera_limits
 
+# Limit of hits: they take 1 GB, and 8 GB more for their gradients. A scene with more is broken rather than large.
 _HITS_MAX = 2**27
-"""Limit of hits: they take 1 GB, and 8 GB more for their gradients. A scene with more is broken rather than large."""
 _lock = threading.RLock()
 _kernels: dict[int, Launch] = {}
 _idle: list["_Workspace"] = []
@@ -50,7 +50,7 @@ def warm_up(channels: int = 3) -> None:
 
 
 class _Workspace:
-    """Scratch memory of one camera, held from forward to backward pass. Reused, because fresh pages are slow."""
+    """Scratch memory of one camera, held from forward to backward pass, and reused."""
 
     def __init__(self):
         self.buffers: dict[str, Tensor] = {}
@@ -60,6 +60,7 @@ class _Workspace:
         """Set the block's field `name` to a buffer of `count` 4-byte values, 64-byte aligned, contents undefined."""
         buffer = self.buffers.get(name)
         if buffer is None or buffer.numel() < count:
+            # A quarter larger than needed, because a new buffer means fresh pages, which are slow.
             buffer = self.buffers[name] = torch.empty(max(64, count + count // 4), dtype=torch.int32)
         setattr(self.block, name, buffer.data_ptr())
 
@@ -100,6 +101,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.sh_stride = 0 if scene.sh is None else 3 * scene.sh.shape[1]
     block.rest_stride = block.sh_stride if scene.sh_rest is None else 3 * scene.sh_rest.shape[1]
     block.channels = image_channels
+    # Rows of whole vectors of 16 floats, aligned to 64 bytes.
     block.record_stride = -(-(source.HEAD + image_channels) // 16) * 16
     block.grad_stride = -(-(source.MOMENTS + image_channels) // 16) * 16
     block.antialiased, block.want_depth = int(scene.settings.antialiased), int(scene.with_depth)
@@ -266,6 +268,7 @@ class _Rasterize(torch.autograd.Function):
             )  # fmt: skip
             ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
         ctx.mark_non_differentiable(median, radii, means2d, weights, top_ids, top_weights)
+        # Outputs that the loss does not use stay None, without images of zeros.
         ctx.set_materialize_grads(False)
         return _Images(image, alpha, median, radii, means2d, weights, top_ids, top_weights)
 
@@ -322,6 +325,7 @@ class _Rasterize(torch.autograd.Function):
             threads = scene.settings.threads
             run_workers(blend, block, source.BLEND_BACKWARD, min(threads, block.tiles_x * block.tiles_y))
             run_workers(stages, block, source.PROJECT_BACKWARD, min(threads, block.chunks))
+            # One sum per chunk, added in a fixed order: the result does not depend on the number of threads.
             grad_view[c, :3] = partial.double().sum(0).reshape(3, 4).float()
         grad_background = None
         if background is not None and ctx.needs_input_grad[10]:

@@ -90,12 +90,13 @@ class _Launcher:
 
 
 class _Fibers:
-    """Context that enables Warp's CPU blocks. A lock admits one thread at a time, because shared memory is static."""
+    """Context that enables Warp's CPU blocks, for one thread at a time."""
 
     def __init__(self, wp: Any):
         self.wp = wp
 
     def __enter__(self) -> None:
+        # Shared memory of fibers is static, so one thread at a time.
         _lock.acquire()
         self.before = self.wp.config.enable_cpu_blocks
         self.wp.config.enable_cpu_blocks = True
@@ -106,11 +107,8 @@ class _Fibers:
 
 
 def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
-    """Parameter structure with the sizes and flags of a call.
-
-    It is the bare ctypes structure, because setting one of its hundred fields through Warp's wrapper takes ten times as
-    long.
-    """
+    """Parameter structure with the sizes and flags of a call."""
+    # The bare ctypes structure: setting one of its hundred fields through Warp's wrapper takes ten times as long.
     args = _structure(wp).ctype()
     args.n, args.cameras, args.width, args.height = (
         scene.means.shape[0],
@@ -156,7 +154,7 @@ class _Maker:
 
 
 class _Zeros(NamedTuple):
-    """Tensors of a call that start at zero: parts of one tensor, because each torch operator costs launches."""
+    """Tensors of a call that start at zero, as parts of one tensor."""
 
     tile_start: Tensor
     tile_end: Tensor
@@ -176,6 +174,7 @@ class _Zeros(NamedTuple):
         slots, tiles = cameras * n, cameras * -(-scene.width // TILE) * -(-scene.height // TILE)
         with_contributions = scene.with_contributions
         weighed = 3 * slots if with_contributions else 0
+        # One tensor for all, because each torch operator costs launches.
         buffer = torch.zeros(4 + weighed + 2 * slots + 2 * tiles, dtype=torch.int32, device=scene.means.device)
         real = buffer.view(torch.float32)
 
@@ -212,6 +211,7 @@ def _bin(launch: _Launcher, args: Any, demand: Demand, depth_key: Tensor, hit_co
     """List the hits tile by tile, front to back."""
     make, capacity = _Maker(depth_key.device), demand.capacity
     slots, tiles = hit_count.shape[0], args.tiles_x * args.tiles_y * args.cameras
+    # Stable, because ties in depth are ordered by index (`constants.py`).
     order = torch.sort(depth_key, stable=True).indices
     ends = torch.cumsum(hit_count.index_select(0, order), 0, dtype=torch.int64)
     sorted_slot = make.empty(capacity, dtype=torch.int32)
@@ -335,6 +335,7 @@ class _Rasterize(torch.autograd.Function):
             ctx.save_for_backward(*saved)
             ctx.scene, ctx.norms, ctx.capacity = scene, zeros.norms, args.capacity
         if out.weight_sum is not None:
+            # Integer sums do not depend on the order of the atomics.
             out = out._replace(weight_sum=out.weight_sum * (1.0 / source.WEIGHT_SCALE))
         ctx.mark_non_differentiable(*(value for value in out[2:] if value is not None))
         ctx.set_materialize_grads(False)
@@ -415,6 +416,7 @@ def rasterize(scene: Scene) -> RasterOutput:
         raise RuntimeError(refusal)
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
     tiles = cameras * -(-scene.width // TILE) * -(-scene.height // TILE)
+    # Thread numbers and slots are int32 in the kernels.
     if max(cameras * n, tiles * source.BLOCK) > 2**31 - source.BLOCK:
         raise ValueError(
             f"{cameras} cameras of {scene.width} x {scene.height} px with {n} Gaussians are too much for "

@@ -1,11 +1,10 @@
 """Capacity of the lists of hits, chosen so that calls of the CUDA rasteriser do not wait for the GPU.
 
-The first call of a device, camera count and image size waits for its number of hits, because a guess is not possible: a
-Gaussian has from 4 to 40 tiles. Afterwards the device keeps the largest number of hits of such calls and copies it to
-the host asynchronously. If a call has more Gaussians than before, the number is scaled up. A call with more hits than
-its list holds is slower but correct: its tiles search all Gaussians in depth order (see `cuda_source.py`), and a later
-call has a larger list. A list takes at most a quarter of the card's free memory. `RasterOutput.hits` holds, on the
-device, the number of hits of a call and the capacity of its list.
+The first call of a device, camera count and image size waits for its number of hits. Afterwards the device keeps the
+largest number of hits of such calls and copies it to the host asynchronously. A call with more hits than its list holds
+is slower but correct: its tiles search all Gaussians in depth order (see `cuda_source.py`), and a later call has a
+larger list. A list takes at most a quarter of the card's free memory. `RasterOutput.hits` holds, on the device, the
+number of hits of a call and the capacity of its list.
 """
 
 import threading
@@ -17,8 +16,8 @@ from .settings import Scene
 
 HITS_MAX = 2**27
 HITS_STEP = 2**12
+# Filled share of a list above which its capacity is raised.
 _FULL = 0.9
-"""Filled share of a list above which its capacity is raised."""
 HIT_BYTES = 40
 """Bytes of one hit: its tile and slot, before and after sorting, the permutation, and scratch memory of the sort."""
 _lock = threading.RLock()
@@ -42,8 +41,10 @@ class Demand:
         The first call waits for its hits, int32 `hit_count` [slots] on the device, and uses their number instead.
         """
         slots = hit_count.shape[0]
+        # The first call has to wait: a Gaussian has from 4 to 40 tiles, so a guess is not possible.
         demand = int(self.host[0]) if self.capacity else int(hit_count.sum(dtype=torch.int64))
         if self.slots and slots > self.slots:
+            # The measured demand belongs to fewer Gaussians.
             demand = demand * slots // self.slots
         self.slots = max(self.slots, slots)
         if self.capacity == 0 or demand > _FULL * self.capacity:

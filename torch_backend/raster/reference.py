@@ -24,8 +24,8 @@ from ..torch_types import (
 from . import constants as k
 from .settings import RasterOutput, Scene, camera_limits
 
+# Largest number of (pixel, Gaussian) pairs blended at once. Blending takes a dozen arrays of this size.
 _LANES = 2**20
-"""Largest number of (pixel, Gaussian) pairs blended at once. Blending takes a dozen arrays of this size."""
 
 
 class _FloorAtZero(torch.autograd.Function):
@@ -155,17 +155,20 @@ def _footprint(scene: Scene, camera: int, index: Tensor) -> _Footprint:
     mean2d = torch.stack((fx * x / z + cx, fy * y / z + cy), -1)
 
     x_low, x_high, y_low, y_high = camera_limits(scene, camera, k.FRUSTUM_MARGIN)
+    # Only the Jacobian uses clamped positions, as in 3DGS: off screen, it would grow without bound.
     u, v, zero = (x / z).clamp(x_low, x_high), (y / z).clamp(y_low, y_high), torch.zeros_like(z)
     J = torch.stack((fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z), -1).reshape(-1, 2, 3)
     scales = scene.log_scales[index].clamp_min(k.LOG_SCALE_MIN).exp()
     B = J @ R @ (rotation_matrices(scene.quats[index]) * scales[:, None, :])
     raw = B @ B.transpose(-1, -2)
+    # EWA's low-pass filter (Zwicker et al. 2001), as a variance in px^2.
     xx, xy, yy = raw[:, 0, 0] + k.LOW_PASS, raw[:, 0, 1], raw[:, 1, 1] + k.LOW_PASS
     # |b0 x b1|^2 equals det(B B^T), and avoids the cancellation in xx yy - xy^2.
     det_raw = cross(B[:, 0], B[:, 1]).square().sum(-1)
     det = det_raw + k.LOW_PASS * (raw[:, 0, 0] + raw[:, 1, 1]) + k.LOW_PASS**2
     opacity = torch.sigmoid(scene.opacity_logits[index])
     if scene.settings.antialiased:
+        # Keeps the integral of a Gaussian that the low-pass widens (Mip-Splatting, Yu et al. 2024).
         opacity = opacity * (det_raw / det).clamp_min(k.COMPENSATION2_MIN).sqrt()
     return _Footprint(mean2d, xx, xy, yy, det, opacity, z)
 
@@ -178,6 +181,7 @@ def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
         candidates = candidates[(z > scene.settings.near) & z.isfinite()]
         f = _footprint(scene, camera, candidates)
         level = 2 * torch.log(f.opacity / k.ALPHA_MIN)
+        # The box of the ellipse alpha >= ALPHA_MIN, which is smaller than 3 sigma for faint Gaussians.
         extent = torch.stack((f.xx, f.yy), -1).mul(level.clamp_min(0)[:, None]).sqrt()
         size = torch.tensor((scene.width, scene.height), dtype=extent.dtype, device=extent.device)
         keep = (level > 0) & (f.xx + f.yy < k.VARIANCE_MAX)
@@ -278,6 +282,7 @@ def _blend(p: _Projected, batch: _Batch, transmittance: Tensor) -> tuple[Tensor,
 
         def gather(grad: Tensor) -> None:
             for total, (s, dx, t, dy) in zip(totals, slopes, strict=True):
+                # Absolute per pixel, so that opposite gradients do not cancel (AbsGS, Ye et al. 2024).
                 pixel = grad * (s.detach() * dx.detach() + t.detach() * dy.detach())
                 total.index_add_(0, members.flatten(), norm_1(pixel, (1, 2)).flatten())
 
@@ -287,6 +292,7 @@ def _blend(p: _Projected, batch: _Batch, transmittance: Tensor) -> tuple[Tensor,
     alpha = alpha.clamp_max(k.ALPHA_MAX).masked_fill(alpha < k.ALPHA_MIN, 0.0)
     after = transmittance[..., None] * torch.cumprod(1 - alpha, -1)
     before = torch.cat((transmittance[..., None], after[..., :-1]), -1)
+    # The Gaussian that crosses T_STOP still counts: the test is on the transmittance before it.
     weights = (alpha * before).masked_fill(before <= k.T_STOP, 0.0)
     sums = weights @ torch.cat((p.colors, p.depth[:, None]), -1)[members]
     return weights, after.detach(), sums, transmittance - weights.sum(-1)

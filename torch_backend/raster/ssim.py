@@ -5,9 +5,7 @@ C++ compiled by Warp computes it in two passes over rows, with the mathematics o
 an axis is B = diag(r) S, where S is the symmetric blur of zero-padded rows and r the reciprocal weight sum inside the
 image. Hence B^T = S diag(r): the backward blur is the plain blur of values multiplied by r.
 
-SSIM depends on the variances only through var x + var y, so the forward pass blurs four fields. They are computed from
-x - 0.5 and y - 0.5, which leaves variances unchanged and reduces float32 cancellation. The gradient is linear in the
-incoming gradient, so it is computed together with the value.
+The fields are computed from x - 0.5 and y - 0.5, which leaves variances unchanged and reduces float32 cancellation.
 """
 
 import ctypes
@@ -26,8 +24,9 @@ from ..torch_types import AutogradContext, applied, once_differentiable
 WINDOW, SIGMA = 11, 1.5
 _HALF = WINDOW // 2
 _LANES = 16
+# Rows per unit of work, so that each loaded row serves several output rows.
 _ROWS = 4
-"""Rows per unit of work, so that each loaded row serves several output rows."""
+# Four, not five: SSIM depends on the variances only through var x + var y.
 _FIELDS_FORWARD, _FIELDS_BACKWARD = 4, 3
 _FIELDS: list[tuple[str, type, str]] = [
     *[(n, ctypes.c_uint64, "const float*") for n in ("image", "target", "inverse_x", "inverse_y")],
@@ -174,6 +173,7 @@ class _Ssim(torch.autograd.Function):
         image, target = image.contiguous(), target.contiguous()
         if ignored is not None:
             target = torch.where(ignored[..., None], image, target)
+        # The gradient is linear in the incoming one, so it is computed together with the value.
         value, gradient = _run(image, target, mix, ctx.needs_input_grad[0], threads)
         if ignored is not None and gradient is not None:
             gradient.masked_fill_(ignored[..., None], 0.0)  # windows of their neighbours cover ignored pixels
