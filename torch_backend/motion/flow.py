@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ..array_types import meshgrid
 
+# Flow is clamped to end at most this many flow pixels outside the picture.
 _OUTSIDE = 16.0
-"""Flow is clamped to end at most this many flow pixels outside the picture."""
 Map = NDArray[Any]
 """float32 [h, w] unless documented otherwise; untyped elements, as in OpenCV's stubs."""
 Mask = NDArray[np.bool_]

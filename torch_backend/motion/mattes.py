@@ -55,9 +55,10 @@ def solve_key(shot: Shot, config: FlowConfig) -> str:
     return content_key(MOTION_VERSION, config, digests, *masks_key(shot))
 
 
+# Every matte needs it, and the files grow with the clip.
 @functools.lru_cache(maxsize=16)
 def _digest(file: Path, *_state: int) -> str:
-    """SHA-256 of a file, cached by inode, size and time: every matte needs it, and the files grow with the clip."""
+    """SHA-256 of a file, cached by inode, size and time."""
     with open_regular(file) as handle:
         return hashlib.sha256(handle.read()).hexdigest()
 

@@ -2,8 +2,7 @@
 
 Dense flow smooths a thin mover, such as an arm in front of a wall or an apple on a thread, into the motion of the wall.
 Two pictures predict the static scene: the render of a static model of the clip, and the median of other frames along
-the still surface. The model errs at far skylines and the median at outlines. The misfit of a pixel is therefore the
-smaller of both differences.
+the still surface. The misfit of a pixel is the smaller of both differences.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from numpy.typing import NDArray
 from .flow import Map, Mask
 from .still import Ray, fitted_brightness
 
+# Depth ratio of `Ray.project` above which a point counts as behind the other camera; the ratio is clamped to 20.
 _BEHIND = 19.0
-"""Depth ratio of `Ray.project` above which a point counts as behind the other camera; the ratio is clamped to 20."""
 _SPARSE = 4
 """Stride in rows and columns of the points to which brightness is fitted."""
 
@@ -74,6 +73,7 @@ def misfit(
     median, number = _median(frame, inverse, references, grid)
     gaps: list[Map] = [np.max(np.abs(frame.colors - np.asarray(each, np.float32)), axis=-1) for each in (shown, median)]
     from_model, from_views = (cv2.GaussianBlur(gap, (0, 0), config.sigma * unit) for gap in gaps)
+    # The smaller difference: the model errs at far skylines, the median at outlines.
     gap = np.where(number >= config.fewest, np.minimum(from_model, from_views), np.float32(0.0))
     return gap / np.float32(max(float(np.quantile(gap, config.usual)), 1.0))
 

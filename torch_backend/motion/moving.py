@@ -33,12 +33,12 @@ _FLOW_WIDTH = 640
 _LARGEST_SCALE = 2.0
 _KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
+# Residual motion is computed in every second key frame, because sways are slow.
 _LEFT_EVERY = 2
-"""Residual motion is computed in every second key frame, because sways are slow."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weight of a score at which it saturates, and weight below which a point is unknown."""
+# Largest number of frames scored ahead of their labelling by the static model. At 640 x 480 they take 100 MB.
 _PREFETCHED = 32
-"""Largest number of frames scored ahead of their labelling by the static model. At 640 x 480 they take 100 MB."""
 
 
 StaticViews = Callable[[int], NDArray[np.uint8] | None]
@@ -100,6 +100,7 @@ class Clip:
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
         ignored = load_mask(self._shot, IGNORE, self.frames[index])
         if ignored is not None:
+            # Otherwise optical flow would spread the stillness of a logo into its surroundings.
             pixels = painted_over(pixels, ignored)
         grey = _sized(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8), self.flow_size)
         colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))
@@ -279,6 +280,7 @@ def _between(
         score, sure = final[neighbour]
         share = sample(sure, at) * found
         total, weight = total + share * sample(score, at), weight + share
+        # A small weight keeps a depth where neither key is matched.
         near = found + np.float32(1e-3)
         inverse, count = inverse + near * sample(scored[neighbour][2], at), count + near
     return (total / np.maximum(weight, 1e-6), weight), inverse / count
@@ -318,6 +320,7 @@ class Labels:
         if shown is None:
             return np.zeros(frame.inverse.shape, np.float32)
         shown = _sized(shown, (clip.flow_size[0] // 2, clip.flow_size[1] // 2))
+        # Without the frame itself, which shows its own movers.
         views = [view for key, view in self._references.items() if clip.keys[key] != frame.index]
         return misfit(frame.sight, frame.inverse, shown, views, frame.grid, 0.5 * clip.unit, self._misfit_config)
 

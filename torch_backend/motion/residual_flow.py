@@ -23,10 +23,10 @@ _FINEST, _STRIDE, _DESCENTS, _REFINEMENTS = 1, 4, 16, 2
 """Settings of DIS: finest scale is half the pictures' resolution, patches every fourth pixel."""
 _SPARSE, _TURNS = 4, 6
 """Stride of the points to which the drift is fitted, and iterations of that reweighted fit."""
+# Upper limit of inverse depth relative to its median; the drift fit clamps nearer points.
 _NEAREST = 5.0
-"""Upper limit of inverse depth relative to its median; the drift fit clamps nearer points."""
+# Squared picture difference below the noise of any camera; added to ratios to keep them finite.
 _FLOOR = 2.0
-"""Squared picture difference below the noise of any camera; added to ratios to keep them finite."""
 
 
 @dataclass
@@ -133,7 +133,7 @@ def _drift(left: list[Map], telling: Mask, inverse: Map, unit: float) -> list[Ma
     """Smooth error of x and y over the picture, [h, w] each, caused by a poor pose, a rolling shutter or the lens.
 
     The model is a second-order polynomial, plus a term in inverse depth for an error of the camera's position. It is
-    fitted robustly to the residual flow `left` at the pixels `telling`. Movers are local, so they stay in the residual.
+    fitted robustly to the residual flow `left` at the pixels `telling`.
     """
     height, width = telling.shape
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j].astype(np.float32)
@@ -149,6 +149,7 @@ def _drift(left: list[Map], telling: Mask, inverse: Map, unit: float) -> list[Ma
     found[0] = np.median(target, axis=0)
     for _ in range(_TURNS):
         gap = np.sum((target - design @ found) ** 2, axis=1)
+        # Robust weights: movers are local, so they stay in the residual.
         weight = 1.0 / np.square(1.0 + gap / max(unit**2, float(np.median(gap))))
         normal = design.T @ (design * weight[:, None]) + 1e-3 * len(design) * np.eye(count)
         found = linear_solution(normal, design.T @ (target * weight[:, None]))

@@ -24,9 +24,9 @@ _NEAR = 2
 """Distance in key frames up to which pictures are comparable even if one is blurred."""
 _AGREES = 1.5
 """Factor on the tolerance up to which a match agrees with a still point."""
+# Squared picture differences: cap of a pair's cost (the point is hidden or gone), and cost added to every depth other
+# than a point's own.
 _MAX_DIFFERENCE, _DEPTH_PENALTY = 400.0, 4.0
-"""Squared picture differences: cap of a pair's cost (the point is hidden or gone), and cost added to every depth other
-than a point's own."""
 
 
 class Ray:
@@ -210,8 +210,8 @@ def _pair(test: StillTest, key: int, seen: Seen, texture: Texture, config: FlowC
 def still_points(pairs: list[Pair], start: Map, depth: float, unit: float, turns: int = 4) -> Map:
     """Inverse depths [h, w] of the still points that fit the matches best, in 1 / solve units, at least 0.
 
-    The fit is robust: distant matches hardly count. Where the matches do not determine it, the inverse depth stays near
-    `start`. `depth` is a typical depth.
+    The fit is robust. Where the matches do not determine it, the inverse depth stays near `start`. `depth` is a typical
+    depth.
     """
     inverse = start.copy()
     stiff = np.float32((0.3 * unit * depth) ** 2)
@@ -222,6 +222,7 @@ def still_points(pairs: list[Pair], start: Map, depth: float, unit: float, turns
             slope = pair.ray.slope(at, over)
             x, y = pair.seen.at[0] - at[0], pair.seen.at[1] - at[1]
             weight = pair.weight * np.float32(1.0 / pair.limit**2)
+            # From the start depth, all matches are distant; afterwards, distant ones hardly count.
             if turn:
                 weight /= np.square(1.0 + (x * x + y * y) * np.float32(1.0 / pair.limit**2))
             top += weight * (x * slope[0] + y * slope[1])
@@ -320,10 +321,7 @@ def fitted_brightness(a: Map, b: Map) -> tuple[float, float]:
 
 
 def _surroundings(inverse: Map, sure: Mask) -> list[Map]:
-    """Candidate inverse depths of each point, [h, w] each: its own, and the farthest and nearest in its neighbourhood.
-
-    The neighbours' depths are candidates because flow smears foreground motion over the background.
-    """
+    """Candidate inverse depths of each point, [h, w] each: its own, the farthest and the nearest around it."""
     known = np.where(sure, cv2.medianBlur(inverse, 5), 0.0).astype(np.float32)
     total, weight = known, sure.astype(np.float32)
     filled, certain = np.zeros_like(known), np.zeros_like(known)
@@ -335,4 +333,5 @@ def _surroundings(inverse: Map, sure: Mask) -> list[Map]:
     filled = np.where(certain > 1e-3, filled / np.maximum(certain, 1e-3), inverse).astype(np.float32)
     filled[sure] = known[sure]
     block = np.ones((17, 17), np.uint8)
+    # Neighbours' depths, because flow smears the motion of the foreground over the background.
     return [filled, cv2.erode(filled, block), cv2.dilate(filled, block)]

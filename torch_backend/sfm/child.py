@@ -17,9 +17,9 @@ from ..shot import need_disk
 _POLL_SECONDS = 0.2
 _LAST_LINES = 3
 _FULL_BYTES = 16 << 20
+# Lines of COLMAP's log that count images and blocks of pairs. (Reading progress from COLMAP's database instead is not
+# safe: a second copy of SQLite in one process breaks the locks of the first copy.)
 _COUNT = re.compile(rb"Process(?:ed|ing) \w+ \[(\d+)/(\d+)\]")
-"""Lines of COLMAP's log that count images and blocks of pairs. (Reading progress from COLMAP's database instead is not
-safe: a second copy of SQLite in one process breaks the locks of the first copy.)"""
 
 
 def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = False) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = Fals
         process = subprocess.Popen(
             command["args"],
             cwd=command["cwd"],
-            stdin=subprocess.PIPE,
+            stdin=subprocess.PIPE,  # the worker exits when it closes
             stdout=subprocess.PIPE,
             stderr=errors,
             env=environment,

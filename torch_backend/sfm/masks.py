@@ -21,19 +21,19 @@ from ..lens.undistort import Undistorter
 from ..shot import Shot, make_folder, write_atomic
 
 IGNORE, PEOPLE = MASK_KINDS
+# A feature depends on its surroundings.
 MARGIN = 3.0
-"""Width of the unmatched margin around a mask, in pixels of a picture 640 wide: a feature depends on its surroundings.
-"""
+"""Width of the unmatched margin around a mask, in pixels of a picture 640 wide."""
 _RIM = 8.0
 """Width of the rim around an ignored region that counts as still, in pixels of a picture 640 wide."""
 _INPAINT_PX = 3.0
+# Largest factor on the number of features of a masked picture: COLMAP counts masked features before it drops them.
 _MOST_FEATURES = 3.0
-"""Largest factor on the number of features of a masked picture: COLMAP counts masked features before it drops them."""
 
+# Masked share of the picture above which more pairs of frames are matched than the usual overlap. The unmasked rest
+# shows too little for those few pairs to hold the clip together. With 70 % of a ray-cast room masked, the usual pairs
+# gave cameras 6 degrees off at 0.5 px, rated Good; all pairs gave 0.14 degrees.
 _WIDE_SHARE = 0.25
-"""Masked share of the picture above which more pairs of frames are matched than the usual overlap. The unmasked rest
-shows too little for those few pairs to hold the clip together. With 70 % of a ray-cast room masked, the usual pairs
-gave cameras 6 degrees off at 0.5 px, rated Good; all pairs gave 0.14 degrees."""
 
 
 def write_matching(
@@ -141,11 +141,9 @@ def painted_over(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_]) -> NDArr
 
 
 def limited(labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None, people: NDArray[np.bool_] | None) -> None:
-    """Sets a motion matte [H, W] to still, 0, in place wherever the masks allow no motion.
-
-    The still area includes a rim around ignored pixels, where scene points that become hidden would seem to move.
-    """
+    """Sets a motion matte [H, W] to still, 0, in place wherever the masks allow no motion."""
     if ignored is not None:
+        # In the rim, scene points that become hidden would seem to move.
         labels[_wider(ignored, _RIM) > 0] = 0
     if people is not None:
         labels[~people] = 0

@@ -1,8 +1,7 @@
 """Matches listed image pairs in several processes, because OpenBLAS in pycolmap's wheel is not thread-safe.
 
-In pycolmap 4.2.1 two threads that call sgemm at once get wrong products (18 of 15,000; one thread 0 of 6000). Two pairs
-then lose half of their matches, and the cameras differ. So one thread of each process matches and another verifies.
-The matches of a pair depend only on its two images: any number of processes makes the same database, to the byte.
+One thread of each process matches and another verifies. The matches of a pair depend only on its two images: any number
+of processes makes the same database, to the byte.
 """
 
 from __future__ import annotations
@@ -64,6 +63,8 @@ def one_thread() -> pycolmap.FeatureMatchingOptions:
     """Matching options: one thread, no GPU."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
+    # In pycolmap 4.2.1, two threads that call sgemm at once get wrong products: 18 of 15,000 calls, 0 of 6000 from one.
+    # Two pairs then lost half of their matches, and the cameras differed.
     options.num_threads = 1
     return options
 

@@ -22,12 +22,13 @@ def filter_points(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> dic
     """The points to train from: error below 2 px, seen by 3 frames or more, in front of all cameras, no far outliers.
 
     `points` holds xyz [P, 3], rgb, error, track and depth [P] (smallest over a point's cameras). `centres` [C, 3] are
-    camera centres. Far means 20 times the median distance from their median, which keeps points seen through windows.
+    camera centres. Far means 20 times the median distance from their median.
     """
     distance = np.linalg.norm(points["xyz"] - np.median(centres, axis=0), axis=1)
     keep = (points["error"] < POINT_MAX_ERROR_PX) & (points["track"] >= POINT_LEAST_TRACK) & (points["depth"] > 0)
     keep &= np.isfinite(points["xyz"]).all(axis=1)
     if keep.any():
+        # Twenty times, to keep what is seen through windows.
         keep &= distance < POINT_FARTHEST * np.median(distance[keep])
     return {name: points[name][keep] for name in ("xyz", "rgb", "error", "track")}
 

@@ -27,8 +27,8 @@ WORDS = {
 """Stages in order, without "solve: ", and their messages; {} is replaced by the progress within the stage."""
 _PIXELS = 640 * 480
 """Size of the frames that the weights were measured with."""
+# Share of the bar and seconds before the first estimate of the remaining time; an earlier one would be a guess.
 _LEAST_SHARE, _LEAST_SECONDS = 0.03, 3.0
-"""Share of the bar and seconds before the first estimate of the remaining time; an earlier one would be a guess."""
 _INTERVAL = 2.0
 """Seconds between two estimates."""
 

@@ -15,8 +15,8 @@ WIDEST = 0.25
 TRAVELLED = 0.2
 """Largest share of the shift between two frames that translation may cause if the camera counts as only rotating.
 Measured in a rendered room: 0.02 when turning, 0.5 to 0.7 when walking past its walls."""
+# Deviation from a rotation caused by noise alone: ratio of the largest to the smallest singular value, minus 1.
 _NOISE = 0.004
-"""Deviation from a rotation caused by noise alone: ratio of the largest to the smallest singular value, minus 1."""
 
 
 def is_pure_rotation(

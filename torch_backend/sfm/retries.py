@@ -1,8 +1,7 @@
 """Retries a solve that is refused or poor: one strategy after the other, each announced before it runs.
 
 Each attempt is a request to the worker in its own folder. COLMAP's database moves from one attempt to the next, so that
-features are extracted twice at most. There is no retry if the camera stands still, only rotates, or moves too little
-for parallax, because no strategy can help then.
+features are extracted twice at most.
 """
 
 from __future__ import annotations
@@ -138,6 +137,7 @@ def next_strategy(best: Attempt, request: dict[str, Any], done: set[str]) -> Str
     `request` is the last request, `done` the names of the strategies that were tried.
     """
     fault = best.fault
+    # No strategy can help a camera that stands still, only rotates, or moves too little for parallax.
     if fault is None or fault.kind in ("still", "turning", "narrow"):
         return None
     more = round(MORE_FEATURES * request["features"])
