@@ -147,8 +147,7 @@ def read_model(folder: Path) -> ColmapModel:
 def write_model(folder: Path, model: ColmapModel, text: bool = False) -> list[Path]:
     """Writes a model into a folder, as .txt if `text`, otherwise as .bin. Returns the files.
 
-    Creates the folder if it is missing. Does not write tracks: they index keypoints, and COLMAP rejects tracks
-    without keypoints.
+    Creates the folder if it is missing. Does not write tracks.
     """
     folder.mkdir(parents=True, exist_ok=True)
     suffix = ".txt" if text else ".bin"
@@ -248,9 +247,10 @@ def _points(rows: list[list[float]], tracks: list[NDArray[np.int64]]) -> ColmapP
 
 
 def _lines(path: Path) -> list[str]:
-    """The lines of a text file without comments. Keeps empty lines: an image without keypoints has one."""
+    """The lines of a text file without comments. Keeps empty lines."""
     with open_regular(path, LONGEST_ARRAYS) as source:
         text = source.read().decode("utf-8")
+    # Empty lines stay: an image without keypoints has one.
     return [line for line in text.splitlines() if not line.lstrip().startswith("#")]
 
 
@@ -315,6 +315,7 @@ def _points_as_bytes(model: ColmapModel) -> bytes:
     points = model.points
     parts = [struct.pack("<Q", len(points.xyz))]
     rows = zip(points.xyz.tolist(), points.rgb.tolist(), points.error.tolist(), strict=True)
+    # Tracks of length 0: they would index keypoints, and COLMAP rejects tracks without keypoints.
     parts += [struct.pack("<Q3d3BdQ", n, *xyz, *rgb, error, 0) for n, (xyz, rgb, error) in enumerate(rows, start=1)]
     return b"".join(parts)
 

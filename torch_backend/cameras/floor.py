@@ -21,8 +21,8 @@ BELOW = 0.05
 """Maximum share of outliers below the floor. A table top has more points below: those of the floor."""
 NEAR = 0.01
 """Largest distance of an inlier from the plane, as a share of the points' median distance from the cameras."""
+# Number of random triples; points for the first scoring; planes scored on all points; maximum number of points.
 _TRIES, _LOOKED_AT, _FINAL, _ALL = 5000, 400, 12, 3000
-"""Number of random triples; points for the first scoring; planes scored on all points; maximum number of points."""
 
 
 def floor_of(path: CameraPath, points: NDArray[Any]) -> dict[str, Any] | None:

@@ -45,8 +45,8 @@ MODEL_FOLDERS = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
 """Subfolders of the chosen folder in which a COLMAP model is searched."""
 _ANGLE_POINTS = 2000
 _MOST_NOTES = 8
+# File extensions that only Blender's importers read, see `splannequin_addon/solve/camera_file.py`.
 _BLENDERS = (".abc", ".fbx", ".usd", ".usda", ".usdc", ".usdz")
-"""File extensions that only Blender's importers read, see `splannequin_addon/solve/camera_file.py`."""
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ def _transforms_lens(file: Path, values: dict[str, Any]) -> Lens:
 
 
 def _rigid(matrix: NDArray[Any], name: str) -> NDArray[np.float64]:
-    """The [3, 4] pose of a rigid [4, 4] matrix. Replaces a rounded rotation by the nearest exact one.
+    """The [3, 4] pose of a rigid [4, 4] matrix, with an exact rotation.
 
     Raises ValueError if the matrix is not finite or not rigid.
     """
@@ -304,6 +304,7 @@ def _rigid(matrix: NDArray[Any], name: str) -> NDArray[np.float64]:
         raise ValueError(
             f"the camera of {name} is scaled, sheared or mirrored: only a rotation and a position are supported"
         )
+    # The nearest exact rotation: files round their numbers.
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt, matrix[:3, 3:]], axis=1)
 

@@ -18,8 +18,8 @@ from .placement import SENSOR_MM, Lens, Similarity, camera_to_world, lens_of, pa
 
 Y_UP = Similarity(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), 1.0, np.zeros(3))
 """Transform from the scene's axes (z up) to Nuke's (y up)."""
+# Gimbal-lock threshold. If the cosine of the x rotation is not above it, the z rotation is set to 0.
 _LEVEL = 1e-9
-"""Gimbal-lock threshold. If the cosine of the x rotation is not above it, the z rotation is set to 0."""
 
 
 def euler_zxy(rotations: NDArray[Any]) -> NDArray[np.float64]:

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 
 def rotation_to_quat(rotation: NDArray[Any]) -> NDArray[np.float64]:
-    """The unit quaternion wxyz (w >= 0) of a [3, 3] rotation.
-
-    Uses the best conditioned of the four formulas of Shepperd (1978).
-    """
+    """The unit quaternion wxyz (w >= 0) of a [3, 3] rotation."""
     r = np.asarray(rotation, np.float64)
     trace = r.trace()
     squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
+    # The best conditioned of four formulas (Shepperd 1978): the others divide by numbers near 0.
     largest = int(np.argmax(squares))
     if largest == 0:
         quat = np.array([1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
@@ -51,6 +49,7 @@ def _multiply(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
 def slerp(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[np.float64]:
     """Spherical interpolation between unit quaternions along the shorter arc: a exp(share log(a^-1 b))."""
     relative = _multiply(a * [1.0, -1.0, -1.0, -1.0], b)
+    # q and -q are the same rotation; this sign gives the shorter arc.
     if relative[0] < 0:
         relative = -relative
     sine = float(np.linalg.norm(relative[1:]))

@@ -31,8 +31,8 @@ _MOST_STEPS = 60
 _DONE_PX = 1e-9
 """Newton's method stops when the largest error over all pixels is below this."""
 _WRONG_PX = 1e-6
+# Steps along each line from the middle to the border in the test for a fold.
 _ALONG = 24
-"""Steps along each line from the middle to the border in the test for a fold."""
 
 
 NARROWEST_DEG, WIDEST_DEG = 12.0, 130.0
@@ -40,8 +40,8 @@ NARROWEST_DEG, WIDEST_DEG = 12.0, 130.0
 focal length ends outside of this range."""
 LEAST_DEG, MOST_DEG = 8.0, 150.0
 """Angles of view outside of this range are an error: 257 mm, 4.8 mm."""
+# Largest plausible factor by which the distortion moves a corner away from the middle, or towards it.
 _MOST_STRETCH = 2.0
-"""Largest plausible factor by which the distortion moves a corner away from the middle, or towards it."""
 
 
 def view_deg(width: int, height: int, focal: float) -> float:

@@ -24,8 +24,8 @@ WIDE_DEG = 100.0
 LEFT_SHARE = 0.003
 """Tolerated distortion at the corners after undistortion, as a share of the diagonal: 2.4 px at 640x480."""
 _SAMPLES = 2048
+# Length of the sampled radial curve, as a multiple of the corner's distance from the middle.
 _BEYOND = 2.0
-"""Length of the sampled radial curve, as a multiple of the corner's distance from the middle."""
 
 
 def angle_deg(model: str, width: int, height: int, params: Sequence[float]) -> float:

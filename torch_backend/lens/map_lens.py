@@ -24,19 +24,19 @@ from ..contract import ExitCode, JobError
 ST_MAP = "ST_MAP"
 """Name of this lens model in solve.json, in the place of COLMAP's model names."""
 _ROWS = 64
+# Spacing in pixels of the grid on which the inverse is solved; minimum number of intervals along a side.
 _NODE_PX, _LEAST_NODES = 8.0, 40
-"""Spacing in pixels of the grid on which the inverse is solved; minimum number of intervals along a side."""
 _MOST_STEPS = 60
+# Errors in pixels: below the first, Newton's method stops; above the second, it has failed.
 _DONE_PX, _WRONG_PX = 1e-9, 1e-6
-"""Errors in pixels: below the first, Newton's method stops; above the second, it has failed."""
 _BEYOND = 0.5
 """Margin around the polynomial's box for the inversion, as a share of the box."""
+# Largest shift in pixels of a map that counts as no distortion.
 _NONE_PX = 1e-3
-"""Largest shift in pixels of a map that counts as no distortion."""
 _GRID = 33
 """Points along each side of the grid in the test for a fold."""
+# Tolerance for pixels of the plate outside of the original picture: maps are not more accurate.
 _SLACK_PX = 0.02
-"""Tolerance for pixels of the plate outside of the original picture: maps are not more accurate."""
 _LEAST_WINDOW, _MOST_WINDOW = 0.1, 2.0
 
 
@@ -205,10 +205,8 @@ class MapLens:
     def _where_between(
         self, x: NDArray[np.float64], y: NDArray[np.float64], ratio: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """`where` by Newton's method at every eighth pixel, interpolated smoothly.
-
-        Takes 0.5 s for HD instead of 11 s for every pixel.
-        """
+        """`where` by Newton's method at every eighth pixel, interpolated smoothly."""
+        # 0.5 s for HD; 11 s at every pixel.
         nodes = [
             np.linspace(0.0, length, max(_LEAST_NODES, math.ceil(length * scale / _NODE_PX)) + 1)
             for length, scale in zip((self.width, self.height), ratio, strict=True)

@@ -42,8 +42,8 @@ STRAIGHT_PX = 0.05
 """Largest distortion in pixels of a map without a lens."""
 SHAPE = 0.03
 """Tolerance for the ratio of the scales along x and y in the middle of the picture, as a natural logarithm."""
+# Margin around the original picture within which values of an undistorting map are used, as a share of the picture.
 _CUT = 0.02
-"""Margin around the original picture within which values of an undistorting map are used, as a share of the picture."""
 _SAMPLES, _CHECKED = 8_000, 60_000
 _LEAST_SHARE = 0.5
 _LARGEST = 32_768
@@ -338,12 +338,9 @@ def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: fl
 
 
 def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect: float, name: str) -> float:
-    """Width over height of the undistorted picture in square pixels. Raises JobError if the map is of another picture.
-
-    In the middle of a lens, the scales along x and y are equal. This determines the aspect ratio of the sampled
-    picture, for any amount of overscan.
-    """
+    """Width over height of the undistorted picture in square pixels. Raises JobError if the map is of another picture."""
     # The window of this lens is the map's whole picture.
+    # In the middle of a lens, the scales along x and y are equal. So they tell the aspect ratio for any overscan.
     slope = lens.slopes_in_the_middle
     width, height = read.size
     footage_shape = source[0] / source[1]

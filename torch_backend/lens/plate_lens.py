@@ -40,9 +40,9 @@ class PlateLens:
     def where(self, width: int, height: int) -> NDArray[np.float32]:
         """Position [height, width, 2] in the original picture of each pixel of the undistorted plate of the same size.
 
-        x and y in pixels, centres at +0.5. Width and height have separate scales: rounding to whole pixels may change
-        the aspect ratio of the working frames.
+        x and y in pixels, centres at +0.5.
         """
+        # Two scales: rounding to whole pixels may change the aspect ratio of the working frames.
         ratio = np.array([width / self.lens.width, height / self.lens.height])
         fx, fy, cx, cy = self.pinhole
         out = np.empty((height, width, 2), np.float32)

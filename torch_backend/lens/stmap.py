@@ -28,8 +28,8 @@ UNDISTORT, REDISTORT = STMAP_FILES
 LARGEST = 16_384
 """Maximum width of a map in pixels."""
 _ROWS = 64
+# Radius of a cubic filter in pixels.
 _FILTER_PX = 2
-"""Radius of a cubic filter in pixels."""
 _TOUCHING_PX = 1e-3
 _MOST_PERCENT = 100.0
 
@@ -62,8 +62,7 @@ def redistort_map(
 def needed_margin(lens: Lens | MapLens, width: int, height: int) -> tuple[int, int]:
     """Overscan in pixels of a frozen frame of `width` x `height`: at left and right, and at top and bottom.
 
-    With this overscan, a bilinear or cubic filter finds all its samples for every pixel of the original frame. Opposite
-    sides have the same overscan, so that the plate stays in the middle.
+    Opposite sides have the same overscan, so that the plate stays in the middle.
     """
     if lens.is_none:
         return 0, 0  # the formula below would give overscan to a smaller frame: its outer pixel centres lie farther in
@@ -75,6 +74,7 @@ def needed_margin(lens: Lens | MapLens, width: int, height: int) -> tuple[int, i
     size = np.array([width, height])
     at = lens.to_plate(border) * (size / [lens.width, lens.height])
     past = np.maximum(0.5 - at.min(axis=0), at.max(axis=0) - (size - 0.5))
+    # A bilinear or cubic filter then finds all its samples for every pixel of the original.
     across, down = (math.ceil(p) + _FILTER_PX if p > _TOUCHING_PX else 0 for p in past)
     return across, down
 

@@ -52,8 +52,7 @@ class BandUndistorter:
     """Like `Undistorter`, for pictures of any size and for unclipped floats. Uses 8 bytes per pixel.
 
     A Catmull-Rom curve is a linear interpolation of two samples, minus t (1 - t) / 2 times a linear interpolation of
-    their second differences. This takes four bilinear look-ups per pixel, band by band. The second differences use
-    values clipped to [0, 1]: otherwise a lamp of fifty times white would get a black ring.
+    their second differences. This takes four bilinear look-ups per pixel, band by band.
     """
 
     def __init__(self, where: NDArray[np.float32]) -> None:
@@ -113,6 +112,7 @@ def _band(
         smooth = cv2.remap(np.ascontiguousarray(inner), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(smooth, np.float32)
 
+    # Clipped, or a lamp of fifty times white would get a black ring.
     core = np.clip(rows, 0.0, 1.0)
     across = _second_difference(core.swapaxes(0, 1)).swapaxes(0, 1)
     both, down = _second_difference(across), _second_difference(core)[:, 1:-1]

@@ -16,14 +16,14 @@ from ..cameras.poses import quat_to_rotation
 
 ZOOM = 0.02
 """Smallest change of focal length within the take that counts as a zoom, as a natural logarithm."""
+# Minimum number of points to estimate the focal length of a frame.
 _LEAST_POINTS = 30
-"""Minimum number of points to estimate the focal length of a frame."""
 _LEAST_FRAMES = 8
 _STEPS = 20
+# Largest change of focal length, as a natural logarithm; beyond it, the refinement has diverged.
 _MOST = 2.0
-"""Largest change of focal length, as a natural logarithm; beyond it, the refinement has diverged."""
+# Threshold of the Huber weights, in pixels.
 _OUTLIER_PX = 1.5
-"""Threshold of the Huber weights, in pixels."""
 
 
 def focal_change(
