@@ -3,16 +3,11 @@
 The deformation field has to explain a whole clip; a freeze needs one instant of it. The frozen Gaussians therefore
 become free parameters. Still pixels are learnt from all trained frames, with movers placed by the run's scene flow.
 Movers at t* are learnt from plate t* alone. Plate t* does not train Gaussians that it sees from much farther away than
-other frames do: a face that is six pixels wide matches the plate with its eyes in any position. The training pictures
-are larger than those of a preview run, so the frozen scene becomes sharper than the run.
+other frames do. The training pictures are larger than those of a preview run, so the frozen scene becomes sharper than
+the run.
 
-A run that is as sharp as its pictures gains nothing on still pixels, and these are then left unchanged. Its movers may
-still be blurred. They are then trained alone, and blended between their states before and after training. The blend
-factor is chosen so that trained frames near t* do not get much worse, because errors of one plate would be misplaced
-there.
-
-The number of Gaussians does not change: densification lost 0.3 dB on held-out frames (docs/decisions.md, "Developing an
-instant").
+If still pixels gain nothing, they are left unchanged. Movers are then trained alone, and blended between their states
+before and after training.
 """
 
 from __future__ import annotations
@@ -115,6 +110,7 @@ class _FineTuning:
         self.frames = sorted({*frames, *self.instants} - {*self.probes})
         self.travel = SceneFlow(run, scene, frozen, t_star)
         self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
+        # No growth: densification lost 0.3 dB on held-out frames (docs/decisions.md, "Developing an instant").
         self.params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in frozen.state.items()}
         self.optimizer = self._optimizer()
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
@@ -124,6 +120,7 @@ class _FineTuning:
         # An undersampled Gaussian that moves in other frames is not trained, because they show it at other times.
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in self.probes or self.instants])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
+        # Added movers (`missing.py`) are trained, too.
         opened[known:] = 1.0
         self.fixed_rows = ((self.undersampled > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
         self.mover_rows = (self.mover * opened > 0.5).nonzero()[:, 0]
@@ -140,6 +137,7 @@ class _FineTuning:
         self._train(steps, self.config.instant_share, checked)
         after = self._judged()
         state = {name: p.detach() for name, p in self.params.items()}
+        # A run as sharp as its pictures gains nothing on still pixels. Its movers may still be blurred.
         if after[0] < before[0] + self.config.gain or after[1] < before[1]:
             state = self._movers_only(lambda _: checked(steps))
         was = self.frozen
@@ -152,6 +150,7 @@ class _FineTuning:
         for n in range(steps):
             check(n)
             for group in self.optimizer.param_groups:
+                # The second half of a training's schedule; `first` is the rate at its middle.
                 group["lr"] = group["first"] * _TRAINING.lr_end ** (0.5 * n / steps)
             if float(torch.rand(1, generator=self.generator, device="cpu")) < instant_share:
                 frame = self.instants[n % len(self.instants)]
@@ -160,6 +159,8 @@ class _FineTuning:
                 frame = self.frames[order.pop()]
             self._step(frame)
             if n >= steps // 2:
+                # One frame a step makes parameters oscillate; their mean is nearer to the optimum of all frames
+                # (`average.py`).
                 mean.add(self.params)
         mean.copy_into(self.params)
 
@@ -186,6 +187,7 @@ class _FineTuning:
             self._show(state)
             errors = self._error(self.instants, movers=True), self._error(neighbours, movers=True)
             first = first if n else errors
+            # Errors of one plate are misplaced in its neighbours, so their loss counts three times.
             benefit = first[0] - errors[0] - self.config.worth * max(0.0, errors[1] - first[1])
             if benefit > best:
                 best, kept = benefit, state
@@ -221,6 +223,7 @@ class _FineTuning:
         return float(sums[0] / sums[1].clamp_min(1.0))
 
     def _step(self, frame: int) -> None:
+        # Another background at every step, so that a hole cannot pass for a grey wall.
         rendered, learnt = self._render(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
         target = torch.where(learnt[..., None], self.plates.picture(frame), rendered.detach())
         loss = photometric(rendered, target, _TRAINING.dssim)
@@ -235,10 +238,7 @@ class _FineTuning:
         self.optimizer.step(guard=[total])
 
     def _render(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """(render [H, W, 3] of the scene moved to a frame, pixels [H, W] bool as from `_learnt`).
-
-        The background colour changes at every step, so that a hole cannot pass for a grey wall.
-        """
+        """(render [H, W, 3] of the scene moved to a frame, pixels [H, W] bool as from `_learnt`)."""
         background = torch.full((3,), 0.5, device=self.device) if background is None else background
         marks = torch.stack([self.mover, self.undersampled], dim=1)
         state = self.travel.moved(dict(self.params), frame)
@@ -255,16 +255,18 @@ class _FineTuning:
         matte, ignored = self.plates.matte(frame), self.plates.ignored(frame)
         learnt = (matte < 0.5) & (mover < 0.5)
         if frame in self.instants:
+            # A face that is six pixels wide matches plate t* with its eyes in any position.
             learnt = learnt | (undersampled < 0.5)
         return learnt if ignored is None else learnt & ~ignored
 
     def _optimizer(self) -> FusedAdam:
-        """Optimiser with the learning rates of mid-training. Means are nearly converged and use the final rate."""
+        """Optimiser with the learning rates of mid-training."""
         c, p = _TRAINING, self.params
         rates = {
             "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities, "sh0": c.lr_sh0,
             "shN": c.lr_sh_rest,
         }  # fmt: skip
+        # Means are nearly converged: they use the final rate. Rates by distance gained nothing (docs/decisions.md).
         rates = {"means": c.lr_means_end, **{name: rate * math.sqrt(c.lr_end) for name, rate in rates.items()}}
         groups = [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()]
         return FusedAdam(groups, eps=1e-15)

@@ -115,6 +115,7 @@ def missing_pixels(
     absent, background_mismatch = (mismatch(picture, render.color, unit, config) for render in (image, background))
     missing = matte * torch.minimum(absent, background_mismatch)
     outline = torch.minimum(difference(image), difference(background))
+    # The depth behind the missing object: only surfaces nearer than it can hold the object.
     inverse, near = 1.0 / image.depth.clamp_min(1e-6), blurred(missing, sigma)
     hidden = blurred(missing * inverse, sigma) / near.clamp_min(1e-6)
     nearer = (inverse / hidden.clamp_min(1e-12) - 1.0).clamp_min(0.0) / config.depth_tolerance
@@ -156,6 +157,7 @@ def _depths(around: Tensor, missing: Tensor, holds: Tensor, inverse: Tensor, lea
         of = regions == n
         holding = of & (weights > 0.0)
         if holding.any() and amounts[of].sum() >= least:
+            # The median: a membrane from adjacent surfaces let one floater bend a hand (docs/decisions.md).
             deep[n] = weighted_median(values[holding], weights[holding])
     return from_numpy(deep[regions])
 

@@ -6,17 +6,12 @@ supervised it: at t*, from all other poses. For example, the field may fade the 
 The static baseline has the same Gaussians as the frozen scene, but its open Gaussians are at the mean of the times at
 which they were seen. Both are compared with plate t*, and with the still pixels of other plates across the clip. A
 Gaussian is closed (made static) if its motion raises the error of the other plates by more than it lowers the error of
-plate t*. If the mattes show no motion at t* and the Gaussian only sways, a third of that increase is enough. Neighbours
-are decided together, because errors are noisy and objects move as a whole. A Gaussian whose motion raises no error
-stays open.
+plate t*. If the mattes show no motion at t* and the Gaussian only sways, a third of that increase is enough. A Gaussian
+whose motion raises no error stays open.
 
-Mattes miss swaying objects and sometimes whole arms, and count their pixels as still. The mean state always fits such
-pixels better, although the plate shows another time than t*. For a Gaussian that moves farther than a sway, the
-advantage of the run at the plate's own time over the baseline is therefore subtracted from the error increase.
-
-Plate t* cannot judge objects that it sees from far away: a face that is six pixels wide matches the plate with its eyes
-in any position. For such objects, plates that see them from near are compared on all pixels, including moving ones. The
-run's advantage is then always subtracted.
+For a Gaussian that moves farther than a sway, the advantage of the run at the plate's own time over the baseline is
+subtracted from the error increase. Plate t* cannot judge objects that it sees from far away. For those, plates that see
+them from near are compared on all pixels, and the run's advantage is always subtracted.
 """
 
 from __future__ import annotations
@@ -85,6 +80,7 @@ def apply_static_baseline(
         return frozen
     pair = _Pair(run, plates, frozen, with_still_means(run, frozen, candidates), candidates, movers, t_star, config)
     near = _nearest(frozen.state["means"][candidates], config.neighbours)
+    # Decided with their neighbours: errors are noisy, and objects move as a whole.
     gain, harm = -pair.worse(instant_frames, near, still=False), pair.worse(plate_frames, near)
     least = torch.where((movers[candidates] > 0.5) | pair.moved, harm, config.doubted * harm)
     stays = (harm <= 0.0) | (gain > least)
@@ -170,9 +166,12 @@ class _Pair:
         if then is None:
             return sums[:, 0, :2]
         near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), -1) <= self.from_near
+        # A face that is six pixels wide in plate t* matches it with its eyes in any position. Near plates judge it on
+        # all pixels.
         sums = torch.where(near[:, None], sums[:, 0], sums[:, 1])
         moved = self._travel(then, frame) > self.sways
         self.moved |= moved & (sums[:, 1] > SEEN)
+        # Mattes miss sways and whole arms. There the mean always fits better, although the plate shows another time.
         sums[:, 0] -= sums[:, 2] * (near | moved)
         return sums[:, :2]
 

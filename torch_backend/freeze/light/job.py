@@ -162,9 +162,8 @@ def seen_from(
 ) -> SeenSplats:
     """Splats relative to a point [3], with the colours seen by the clip's cameras at [C, 3]; all in one space.
 
-    View-dependent colours are only learnt for the directions of the clip's cameras and are arbitrary elsewhere. Each
-    splat therefore gets its colour for the camera whose viewing direction is nearest to the point's. Splats that would
-    smear are left out, see `LightConfig`. JobError if there are no splats around the point.
+    Each splat gets its colour for the camera whose viewing direction is nearest to the point's. Splats that would smear
+    are left out, see `LightConfig`. JobError if there are no splats around the point.
     """
     means = from_numpy(splats.means).double() - from_numpy(point)
     distances = norm(means, -1)
@@ -200,6 +199,7 @@ def _colors(sh: Tensor, means: Tensor, cameras: Tensor) -> Tensor:
         ray = means - camera
         ray = ray / norm(ray, -1, keepdim=True).clamp_min(1e-9)
         cosine = (ray * directions).sum(-1)
+        # Harmonics are arbitrary in directions in which no camera of the clip looked.
         along = torch.where((cosine > best)[:, None], ray, along)
         best = torch.maximum(best, cosine)
     return ((sh_basis(along, degree)[..., None] * sh).sum(1) + 0.5).clamp_min(0.0)

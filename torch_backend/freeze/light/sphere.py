@@ -19,10 +19,10 @@ HALF_FACE = math.radians(50.0)
 """Half the field of view of a face. Beyond 45 degrees, neighbouring faces overlap and are blended."""
 OVERSAMPLING = 2
 """Number of samples per pixel of the panorama, along each axis."""
+# Rows of the coarsest level of the fill, one for every 6 degrees.
 _COARSEST = 32
-"""Rows of the coarsest level of the fill, one for every 6 degrees."""
+# Number of relaxation sweeps per level of the fill. Coarser levels have already solved longer wavelengths.
 _SWEEPS = 24
-"""Number of relaxation sweeps per level of the fill. Coarser levels have already solved longer wavelengths."""
 
 
 def directions(width: int, height: int) -> NDArray[np.float32]:
@@ -95,8 +95,7 @@ def filled(picture: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
 
     Covered pixels keep their colour. The others are filled by a membrane: each pixel is the mean of its neighbours on
     the sphere. The membrane is relaxed from coarse to fine. The coarsest level starts from a mean of all covered
-    pixels, weighted by 1 / distance^4 on the sphere, so that there is no seam at the border or the poles. W is 2 H,
-    and H is 32 times a power of two.
+    pixels, weighted by 1 / distance^4 on the sphere. W is 2 H, and H is 32 times a power of two.
 
     ValueError if no pixel is covered.
     """
@@ -109,6 +108,7 @@ def filled(picture: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     rows = _COARSEST
     while True:
         small = picture if rows == height else _smaller(picture, rows)
+        # The coarsest level starts without a seam at the border or the poles.
         start = _weighted(small) if color is None else _upsampled(color)
         color = _relaxed(small, start)
         if rows == height:

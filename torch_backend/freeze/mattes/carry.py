@@ -56,8 +56,7 @@ def carry(
 ) -> Iterator[tuple[TakeFrame, dict[str, Matte]]]:  # fmt: skip
     """Yields frames of a take, `in_order`, each with a matte [H, W] for every name.
 
-    The mattes of every frame vote, too, so that parts of an object hidden in the lassoed frame are found once the
-    camera shows them. KeyError if `read` does not know the frame of a polygon.
+    KeyError if `read` does not know the frame of a polygon.
     """
     order = in_order(polygons, frames)
     lassoed = [number for number in order if any(number in of for of in polygons.values())]
@@ -81,6 +80,7 @@ def carry(
         for name in polygons:
             lasso = lasso_mattes.get((number, name))
             mattes[name] = _refined(votes[name], frozen, frame, config) if lasso is None else lasso
+        # Mattes of every frame vote, too: parts that the lassoed frame hides are found once the camera shows them.
         carried = {name: matte for name, matte in mattes.items() if (number, name) not in lasso_mattes}
         _add(votes, _votes_of(carried, frame, frozen))
         yield frame, mattes

@@ -21,10 +21,10 @@ def matte_file(folder: TakeFolder, name: str, frame: int, suffix: str) -> Path:
 def write_matte(path: Path, matte: NDArray[np.float32], margin: tuple[int, int], key: str) -> None:
     """Writes a matte [H, W] in 0..1, atomically.
 
-    R, G and B of an EXR (half) or a PNG (16 bits, linear) all hold the matte, so that every program shows it as a
-    picture. A PNG has no overscan: `margin` pixels (left and right, above and below) are cropped. OSError if the file
-    cannot be written.
+    R, G and B of an EXR (half) or a PNG (16 bits, linear) all hold the matte. A PNG has no overscan: `margin` pixels
+    (left and right, above and below) are cropped. OSError if the file cannot be written.
     """
+    # Three channels, so that every program shows the matte as a picture.
     three = np.repeat(matte[..., None], 3, axis=2)
     if path.suffix == ".png":
         across, down = margin

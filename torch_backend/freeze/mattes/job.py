@@ -171,7 +171,8 @@ def _lassos(take: _Take, params: MatteParams) -> list[Lasso]:
 
 
 def _keys(take: _Take, lassos_by_name: Mapping[str, list[Lasso]]) -> dict[str, str]:
-    """Name -> key of the matte's inputs. All frames are included, because every frame votes on the matte."""
+    """Name -> key of the matte's inputs."""
+    # All frames, because every frame votes on the matte.
     frame_keys = [[n, read_key(take.folder.frame(n))] for n in take.frames]
     settings = dataclasses.asdict(SegmentConfig())
     return {

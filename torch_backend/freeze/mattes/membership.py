@@ -31,24 +31,22 @@ def vote(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, weights: Tensor, d
     """[N, C]: visible pixels of each Gaussian in a camera, weighted by each of the pictures `weights` [H, W, C].
 
     viewmat [4, 4] is in scene units, K [3, 3] in pixels of the pictures. `depth` [H, W] of the visible surface is along
-    the camera's axis, scene units. A Gaussian with its centre outside the picture gets no votes, because the picture
-    may show only a hundredth of it. A Gaussian that is not `in_front` gets none either.
+    the camera's axis, scene units. Gaussians with centres outside the picture, or not `in_front`, get no votes.
     """
     device = frozen.support.device
     height, width, _ = weights.shape
     camera = viewmat.to(device), K.to(device)
     pixels, _ = project(frozen.state["means"], *camera)
+    # Of a Gaussian with its centre outside, the picture may show only a hundredth.
     seen = (inside(pixels, width, height, soft=1e-3) > 0.0) & in_front(frozen, *camera, depth)
     return gathered(frozen.state, *camera, width, height, weights.to(device)) * seen[:, None]
 
 
 def in_front(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, depth: Tensor) -> Tensor:
-    """[N] bool: False for Gaussians behind the visible surface at their pixel; `depth` [H, W] as in `vote`.
-
-    Splats of a person are not opaque. Without this test, a wall that shines through would become part of the person.
-    """
+    """[N] bool: False for Gaussians behind the visible surface at their pixel; `depth` [H, W] as in `vote`."""
     pixels, distances = project(frozen.state["means"], viewmat, K)
     surface = look_up(depth.to(pixels.device), pixels, "nearest")
+    # Splats of a person are not opaque: a wall that shines through would become part of the person.
     return distances < surface * (1.0 + THICK)
 
 

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from ...array_types import pieces
 from .volume import SIDE, View
 
+# Smallest share and smallest number of views that must confirm the depth of a small piece to keep it. On the bundled
+# clip, two hands without a forearm have 0.6 and 0.7 of 22 and 23 views; noise has at most 0.4, or 3 views.
 _CONFIRMED, _VIEWS = 0.5, 3.0
-"""Smallest share and smallest number of views that must confirm the depth of a small piece to keep it. On the bundled
-clip, two hands without a forearm have 0.6 and 0.7 of 22 and 23 views; noise has at most 0.4, or 3 views."""
+# Number of triangles of the smallest piece that is kept: a square of twice the truncation. Smaller pieces are noise
+# near a surface.
 _SMALLEST = 2 * SIDE**2
-"""Number of triangles of the smallest piece that is kept: a square of twice the truncation. Smaller pieces are noise
-near a surface."""
+# Number of vertices per row in look-ups, because OpenCV limits pictures to 32767 rows and columns.
 _COLUMNS = 512
-"""Number of vertices per row in look-ups, because OpenCV limits pictures to 32767 rows and columns."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,8 @@
 """Truncated signed distance function (TSDF) of a frozen scene, averaged over the depth of many views.
 
 The method is that of Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images" (SIGGRAPH
-1996). Only blocks of voxels near surfaces are stored (Nießner et al. 2013). Pixels resolve less and depth errors grow
-with the distance of a surface, so voxels grow with the distance from the cameras. They are uniform in a contracted
-space (as in Barron et al., "Mip-NeRF 360", 2022, with a logarithm).
+1996). Only blocks of voxels near surfaces are stored (Nießner et al. 2013). Voxels grow with the distance from the
+cameras: they are uniform in a contracted space (as in Barron et al., "Mip-NeRF 360", 2022, with a logarithm).
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from numpy.typing import NDArray
 
 SIDE = 8
 """Number of voxels along each edge of a block."""
+# Number of bits per coordinate in a block's key: a million blocks along each axis.
 _BITS = 20
-"""Number of bits per coordinate in a block's key: a million blocks along each axis."""
+# Number of blocks that are processed at once: 4 MB per float of a voxel.
 _CHUNK = 2048
-"""Number of blocks that are processed at once: 4 MB per float of a voxel."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +108,7 @@ class Contraction:
 
     def into(self, points: NDArray[Any]) -> NDArray[Any]:
         """Points [..., 3] in the contracted space."""
+        # Far pixels resolve less, and their depth is less exact, so voxels grow with the distance.
         scale = self.scale(points)[..., None]
         return self.centre + (points - self.centre) * ((1.0 + np.log(scale)) / scale)
 
@@ -239,8 +239,10 @@ def _add(total: NDArray[Any], weight: NDArray[Any], view: View, points: NDArray[
     x, y, depth, cuts = x[rows], y[rows], depth[rows], cuts[rows]
     surface = view.depth_at(x, y, cuts)
     distance = (surface - depth) / cuts
+    # Beyond the truncation behind a surface, a view knows nothing (Curless and Levoy 1996).
     is_valid = (surface > 0.0) & (distance > -1.0)
     sigma = view.look(view.sigma, x, y, nearest=True)
+    # DepthSigma only weights: a view with a large error counts less, it is not excluded.
     trust = np.where(is_valid, 1.0 / (1.0 + np.square(sigma / cuts)), 0.0).astype(np.float32)
     total[rows] += trust * np.minimum(distance, 1.0)
     weight[rows] += trust

@@ -1,8 +1,6 @@
 """Decisions that do not depend on rounding: soft masks, [h, w] in 0..1, replace bool masks.
 
-Another instruction set or picture size changes floats by about 1e-7. With a hard threshold, a pixel on the threshold
-would then switch from one plate to another. A threshold is therefore a ramp (`above`), and of plates that are about
-equally good the first is chosen.
+A threshold is a ramp (`above`), and of plates that are about equally good the first is chosen.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ _SHARPEST = 1e-4
 def above(value: Tensor | float, threshold: Tensor | float) -> Tensor:
     """Soft `value > threshold` in 0..1, for a threshold of 0 or more: a ramp of +-`MARGIN` * threshold around it."""
     value = torch.as_tensor(value, device="cpu")
+    # Another instruction set or picture size changes floats by 1e-7. At a hard threshold, a pixel would switch plates.
     width = 2.0 * MARGIN * threshold
     width = width.clamp_min(_SHARPEST) if isinstance(width, Tensor) else max(width, _SHARPEST)
     return ((value - threshold) / width + 0.5).clamp(0.0, 1.0)

@@ -16,8 +16,8 @@ from torch.nn import functional as F
 from ...torch_types import from_numpy
 from ..bands import BAND_PIXELS
 
+# Rows around a sample position that a bicubic look-up may read.
 _REACH = 3
-"""Rows around a sample position that a bicubic look-up may read."""
 
 
 def pixel_centres(width: int, height: int, device: torch.device | str = "cpu") -> Tensor:
@@ -52,6 +52,7 @@ def look_up(picture: Tensor, pixels: Tensor, mode: str = "bilinear") -> Tensor:
     """
     flat = picture[..., None] if picture.ndim == 2 else picture
     size = torch.tensor([flat.shape[1], flat.shape[0]], dtype=pixels.dtype, device=pixels.device)
+    # Clamped, because points behind the camera have pixels of -1e6.
     at = (pixels / size * 2.0 - 1.0).reshape(1, -1, 1, 2).clamp(-4.0, 4.0)
     found = F.grid_sample(
         flat.permute(2, 0, 1)[None].float(), at, mode=mode, padding_mode="border", align_corners=False

@@ -14,8 +14,8 @@ from ..frozen import FrozenGaussians, freeze_at
 
 HIDDEN = -20.0
 """Opacity logit that makes a Gaussian invisible."""
+# Number of frames whose changes are cached: about 3 MB each for 25,000 open Gaussians.
 _KEPT = 90
-"""Number of frames whose changes are cached: about 3 MB each for 25,000 open Gaussians."""
 
 
 class SceneFlow:

@@ -35,12 +35,12 @@ LENGTHS_OF = 640
 """Picture width in pixels to which all configured lengths refer."""
 MARGIN = 2
 """Possible misplacement of an outline, in pixels at width `LENGTHS_OF`: errors of flow and depth, and motion blur."""
+# Largest number of cached plates. Between two uses of a plate, 16 frames apart, up to 80 other plates are used. With a
+# smaller cache, every plate was computed three times per take.
 _VIEWS, _VIEWS_BYTES = 90, 700e6
-"""Largest number of cached plates. Between two uses of a plate, 16 frames apart, up to 80 other plates are used. With a
-smaller cache, every plate was computed three times per take."""
 _RESIDUALS_BYTES = 250e6
+# Largest width in pixels of the model's own render of a plate: splats show no finer detail, and 4K costs memory.
 _FINEST = 1280
-"""Largest width in pixels of the model's own render of a plate: splats show no finer detail, and 4K costs memory."""
 _ROWS = 256
 
 
