@@ -37,8 +37,7 @@ MOST_PIXELS = 1 << 27
 
 
 def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, windows: bool = os.name == "nt") -> T:
-    """Result of `act`, which is retried while Windows refuses access, by default for two seconds. A reader, a virus
-    scanner or a process that renames another file may hold the file open for a moment.
+    """Result of `act`, which is retried while Windows refuses access, by default for two seconds.
 
     PermissionError if the last try fails.
     """
@@ -46,6 +45,7 @@ def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, window
         tries -= 1
         try:
             return act()
+        # A reader, a virus scanner or a process that renames another file may hold the file open for a moment.
         except PermissionError:
             if not windows or tries <= 0:
                 raise
@@ -55,10 +55,10 @@ def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, window
 def open_regular(path: str | Path, longest: int | None = None) -> BinaryIO:
     """Opens a regular file (or a link to one) for reading, without blocking.
 
-    A shot folder may come from anywhere: a pipe would block Blender's main thread, a device would fill its memory.
     FileNotFoundError or another OSError from the system. UnreadableFile, a ValueError, if the path is not a regular
-    file, or if it has more than `longest` bytes. A sparse file may be that long without using disk space.
+    file, or if it has more than `longest` bytes.
     """
+    # A shot folder may come from anywhere: a pipe would block Blender's main thread, a device would fill its memory.
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
     def opened() -> BinaryIO:
@@ -76,6 +76,7 @@ def open_regular(path: str | Path, longest: int | None = None) -> BinaryIO:
         found = os.fstat(source.fileno())
         if not stat.S_ISREG(found.st_mode):
             raise UnreadableFile(path, "is not a file")
+        # A sparse file may be that long without using disk space.
         if longest is not None and found.st_size > longest:
             raise UnreadableFile(path, f"is {found.st_size / 1e9:.1f} GB, too large for this kind of file")
     except BaseException:
@@ -133,6 +134,7 @@ def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
     if is_long or len(text) > longest:
         raise UserError(f"{path} is larger than {longest >> 20} MB, more than any file of Splannequin")
     try:
+        # Python would accept NaN and Infinity, which other programs do not read.
         data = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:  # ValueError: invalid JSON or UTF-8, or too many digits
         raise UserError(f"{path} is not valid JSON: {error}") from error
@@ -185,6 +187,7 @@ def checked_name(name: str, what: str) -> str:
 
 
 _NAME = re.compile(r"\w[\w .-]{0,63}")
+# Windows also reserves COM and LPT with superscript digits.
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in "0123456789¹²³")}
 
 
@@ -213,8 +216,8 @@ def remove_link(path: Path) -> None:
         os.unlink(path)
 
 
+# stat.IO_REPARSE_TAG_MOUNT_POINT, which Python defines on Windows only: tag of a junction, a link to a folder.
 _JUNCTION = 0xA0000003
-"""stat.IO_REPARSE_TAG_MOUNT_POINT, which Python defines on Windows only: tag of a junction, a link to a folder."""
 
 
 def frame_file(frame: int, suffix: str) -> str:

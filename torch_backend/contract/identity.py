@@ -14,8 +14,8 @@ from .files import open_regular
 BLOCKS, BLOCK_BYTES = 64, 1 << 14
 """Number and size in bytes of the blocks that are read of a large file, spread evenly over the file. A block is about
 one row of an uncompressed 4K picture. In a compressed file, a change alters everything after it."""
+# Number of files read at once, because reading from a network disk is mostly waiting.
 _READERS = 8
-"""Number of files read at once, because reading from a network disk is mostly waiting."""
 
 
 def file_digest(path: str | Path) -> str:

@@ -166,10 +166,8 @@ def missing_shot_error(shot: Path, kind: str) -> JobError:
 
 
 def runs_job(pid: int, started: float, folder: Path) -> bool:
-    """True if a process is certainly the job of a folder: it has this start, and its command line runs that job.
-
-    The process id in a file is not enough to end a process: the author of the file could name any process.
-    """
+    """True if a process is certainly the job of a folder: it has this start, and its command line runs that job."""
+    # The id in a file is not enough to end a process: the author of the file could name any process.
     found = process(pid) if pid > 1 else None
     if found is None or not started or found.started != started:
         return False

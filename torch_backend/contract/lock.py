@@ -35,6 +35,7 @@ class Writer:
 
     def works(self) -> bool:
         """True if the process lives, even if it is suspended. A process on another computer counts as alive."""
+        # Processes of another computer cannot be seen from here.
         return self.host != computer_name() or runs_still(self.pid, self.process_started)
 
 

@@ -27,14 +27,11 @@ GRACE_SECONDS = 30.0
 
 
 def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]:
-    """`args` and `cwd` for a `Popen` that runs a module of this project; paths in `words` should be absolute.
-
-    Python imports modules from its working directory unless it gets -P, and a shot folder may come from anywhere. The
-    loader of libraries also searches the working directory (Windows always, Linux with an empty entry in
-    LD_LIBRARY_PATH). The working directory is therefore the interpreter's folder, which holds no foreign files. The
-    folder of the shot or the extension will not do, because Windows does not move or remove a working directory.
-    """
+    """`args` and `cwd` for a `Popen` that runs a module of this project; paths in `words` should be absolute."""
     python = os.path.abspath(python)
+    # -P: Python would import modules from its working directory, and a shot folder may come from anywhere. Libraries
+    # are searched there, too (Windows always, Linux with an empty entry in LD_LIBRARY_PATH). The interpreter's folder
+    # holds no foreign files, and Windows may still move the folder of the shot.
     return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
 
 
@@ -48,11 +45,9 @@ def child_environment(root: Path) -> dict[str, str]:
 
 
 def detach_standard_input() -> int:
-    """A private handle of the standard input, for a thread that reads it. The null device replaces handle 0.
-
-    On Windows, any access to a pipe blocks while a thread waits to read from it. Otherwise, a child that inherits the
-    pipe would block at its start, and a library while it is loaded.
-    """
+    """A private handle of the standard input, for a thread that reads it. The null device replaces handle 0."""
+    # On Windows, any access to a pipe blocks while a thread waits to read from it. A child that inherits the pipe would
+    # block at its start, and a library while it is loaded.
     standard_input = os.dup(0)
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
@@ -84,10 +79,8 @@ def _stop_with_starter(starter: int, grace_seconds: float) -> None:
 
 
 def program(name: str) -> str | None:
-    """Absolute path of a program on the PATH; None if there is none, or if the working directory has one of this name.
-
-    On Windows, `shutil.which` searches the working directory first, which may have come with a .blend or a clip.
-    """
+    """Absolute path of a program on the PATH; None if there is none, or if the working directory has one."""
+    # On Windows, `which` searches the working directory first, which may have come with a .blend or a clip.
     found = shutil.which(name)
     return found if found and os.path.isabs(found) else None
 
@@ -166,9 +159,10 @@ def process_start(pid: int) -> float:
 def runs_still(pid: int, started: float) -> bool:
     """True if a process of this computer with this id and start lives, even if it is suspended.
 
-    If a start is unknown, the id alone decides, so that a living job is not declared dead.
+    If a start is unknown, the id alone decides.
     """
     found = process(pid)
+    # Rather a dead job believed alive than a living one declared dead.
     return found is not None and (not found.started or not started or found.started == started)
 
 

@@ -21,8 +21,8 @@ from .errors import disk_error
 from .files import is_link, patiently, remove_link
 from .identity import file_digest
 
+# Shot folders that jobs of this process work on.
 _worked_on: list[Path] = []
-"""Shot folders that jobs of this process work on."""
 
 
 @contextlib.contextmanager
@@ -39,13 +39,13 @@ def working_on(*roots: Path) -> Generator[None]:
 def make_folder(path: Path) -> None:
     """Makes a folder and its missing parents.
 
-    FileNotFoundError if the folder belongs to a shot that a job works on, and the shot was moved or deleted. Otherwise
-    a nearly empty folder under the shot's old name would look like a shot.
+    FileNotFoundError if the folder belongs to a shot that a job works on, and the shot was moved or deleted.
     """
     root = next((root for root in _worked_on if root == path or root in path.parents), None)
     if root is None:
         path.mkdir(parents=True, exist_ok=True)
         return
+    # A nearly empty folder under the old name of a moved shot would look like a shot.
     if root == path:
         root.stat()
     for part in reversed([path, *path.parents][: len(path.relative_to(root).parts)]):
@@ -69,6 +69,8 @@ def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
     partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
     try:
         yield partial
+        # Flushed before the rename, or a power cut could leave an empty file under the final name. Windows only flushes
+        # handles that may write.
         with open(partial, "rb+") as handle:
             os.fsync(handle.fileno())
         replace_file(partial, path)
@@ -88,12 +90,12 @@ def is_half_written(name: str) -> bool:
 
 
 def sweep_half_written(folder: Path) -> None:
-    """Removes half-written files of killed processes from a folder: those unchanged for an hour. Their age is measured
-    with the clock of the disk, which dates the files of all computers that write there."""
+    """Removes half-written files of killed processes from a folder: those unchanged for an hour."""
     left = [file for file in folder.glob(".*.tmp*") if is_half_written(file.name)]
     if not left:
         return
     with contextlib.suppress(OSError):  # the folder is read-only
+        # The disk's clock dates the files of all computers that write there.
         now = disk_time(folder)
         for file in left:
             with contextlib.suppress(OSError):  # another process removed it, or it belongs to another user
@@ -195,6 +197,7 @@ def try_lock(handle: int) -> bool:
         if sys.platform == "win32":
             import msvcrt
 
+            # Windows locks bytes from the current position on.
             os.lseek(handle, 0, os.SEEK_SET)
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
         else:

@@ -338,7 +338,7 @@ def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: fl
 
 
 def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect: float, name: str) -> float:
-    """Width over height of the undistorted picture in square pixels. Raises JobError if the map is of another picture."""
+    """Width over height of the undistorted picture in square pixels. JobError if the map is of another picture."""
     # The window of this lens is the map's whole picture.
     # In the middle of a lens, the scales along x and y are equal. So they tell the aspect ratio for any overscan.
     slope = lens.slopes_in_the_middle
