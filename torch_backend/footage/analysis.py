@@ -21,10 +21,10 @@ THUMB_WIDTH, THUMB_HEIGHT = 64, 36
 BLANK_DEVIATION = 1.5 / 255.0
 DUPLICATE_DIFFERENCE = 0.5 / 255.0
 BLUR_RATIO = 0.7
+# Minimum and maximum luma of a log clip: Canon Log has black at 0.073.
 _LOG_BLACK, _LOG_WHITE = 0.06, 0.9
-"""Minimum and maximum luma of a log clip: Canon Log has black at 0.073."""
+# Largest difference of the channels in a log clip. Measured: 0.20 in log, 0.31 to 0.58 in three display clips.
 _LOG_SATURATION = 0.25
-"""Largest difference of the channels in a log clip. Measured: 0.20 in log, 0.31 to 0.58 in three display clips."""
 TARGET_SOLVED = 68
 MAX_STEP_SECONDS = 0.4
 
@@ -56,15 +56,13 @@ class FrameMeasures:
 
 
 def measure(frame: int, pixels: NDArray[Any], display: Display = PLAIN) -> FrameMeasures:
-    """Measures a working frame, [H, W, 3] uint8 or uint16, encoded for `display`.
-
-    The exposure counts values above white as white, so that a lamp that enters the picture does not change it.
-    """
+    """Measures a working frame, [H, W, 3] uint8 or uint16, encoded for `display`."""
     scale = 1.0 / (65535.0 if pixels.dtype == np.uint16 else 255.0)
     luma = (pixels @ LUMA) * np.float32(scale)
     inner = luma[1:-1, 1:-1]
     laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4.0 * inner
     thumb = thumbnail(pixels) * np.float32(scale)
+    # The exposure counts values above white as white, so that a lamp that enters the picture does not change it.
     light = srgb_to_linear(np.minimum(display.straightened(thumb), np.float32(1.0)))
     luminance = float((light @ LUMA).mean())
     flags = ["blank"] if float(luma.std()) < BLANK_DEVIATION else []
@@ -89,11 +87,9 @@ def tones_of(luma: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def looks_like_log(measures: Sequence[FrameMeasures]) -> tuple[float, float] | None:
-    """Luma of the darkest and brightest tones of a clip, 0 to 1, if it looks like log footage; else None.
-
-    Camera logs encode black at 7 to 13 % and unclipped highlights below 90 %. Pictures for a display usually reach 3 %
-    and 97 % in some frame, and have twice the saturation.
-    """
+    """Luma of the darkest and brightest tones of a clip, 0 to 1, if it looks like log footage; else None."""
+    # Camera logs encode black at 7 to 13 % and unclipped highlights below 90 %. Pictures for a display usually reach 3
+    # % and 97 % in some frame, and have twice the saturation.
     usable = [m for m in measures if not m.flags and m.thumb.size]
     darkest = min((m.tones[0] for m in usable), default=0.0)
     brightest = max((m.tones[1] for m in usable), default=1.0)
@@ -128,7 +124,8 @@ def flag_duplicate(current: FrameMeasures, last_distinct: FrameMeasures | None) 
 
 
 def automatic_step(count: int, fps: float) -> int:
-    """Step that selects about 68 of `count` frames, at most 0.4 s apart: at larger gaps, feature tracks break."""
+    """Step that selects about 68 of `count` frames, at most 0.4 s apart."""
+    # At larger gaps, feature tracks break.
     longest = max(1, round(fps * MAX_STEP_SECONDS)) if fps > 0 else 1
     steps = range(1, min(longest, max(1, count // 8)) + 1)
     return min(steps, key=lambda s: abs(np.log(max(1.0, count / s) / TARGET_SOLVED)))

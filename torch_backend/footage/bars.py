@@ -14,31 +14,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Minimum number of pictures for a decision.
 _LEAST_FRAMES = 12
-"""Minimum number of pictures for a decision."""
+# Minimum and maximum size of one bar, as a share of the picture's side. Thinner borders are camera artefacts.
 _LEAST, _MOST = 0.012, 0.45
-"""Minimum and maximum size of one bar, as a share of the picture's side. Thinner borders are camera artefacts."""
+# Largest difference of a bar's pixel from the bar's colour, in steps of 255. Compression causes no more.
 _FLAT = 6.0
-"""Largest difference of a bar's pixel from the bar's colour, in steps of 255. Compression causes no more."""
+# Minimum share of pixels with the bar's colour in a line, in nearly every frame. The rest may be a subtitle.
 _FLAT_SHARE = 0.7
-"""Minimum share of pixels with the bar's colour in a line, in nearly every frame. The rest may be a subtitle."""
+# Minimum difference between bar and picture at the border, in steps of 255.
 _STEP = 14.0
-"""Minimum difference between bar and picture at the border, in steps of 255."""
+# Minimum share of the border with a difference of `_STEP` just inside it, less that share just outside. Measured in
+# three compressed clips: 0.67 to 0.99 with added bars, at most 0.06 if underexposed until blacks clip.
 _STEP_SHARE = 0.4
-"""Minimum share of the border with a difference of `_STEP` just inside it, less that share just outside. Measured in
-three compressed clips: 0.67 to 0.99 with added bars, at most 0.06 if underexposed until blacks clip."""
+# Minimum share of frames that agree.
 _OFTEN = 0.9
-"""Minimum share of frames that agree."""
+# Largest ratio of detail in a blurred bar to detail in the picture. Measured in three clips: 0.16 to 0.38.
 _SMOOTH = 0.45
-"""Largest ratio of detail in a blurred bar to detail in the picture. Measured in three clips: 0.16 to 0.38."""
+# Minimum ratio of the step at a blurred bar's border to the steps of the picture nearby.
 _STANDS_OUT = 1.4
-"""Minimum ratio of the step at a blurred bar's border to the steps of the picture nearby."""
+# Number of lines on each side of a border that scaling and compression blur.
 _NEAR = 3
-"""Number of lines on each side of a border that scaling and compression blur."""
 
 
+# Number of lines of the picture that scaling and compression mix with a bar.
 _MIXED = 2
-"""Number of lines of the picture that scaling and compression mix with a bar."""
 
 
 @dataclass(frozen=True)

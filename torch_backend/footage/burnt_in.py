@@ -17,24 +17,24 @@ WIDTH = 640
 """Maximum width of the analysed pictures."""
 FRAMES = 48
 """Maximum number of analysed pictures, spread evenly over the clip."""
+# Minimum number and width of the pictures for a decision.
 _LEAST_FRAMES, _LEAST_WIDTH = 12, 160
-"""Minimum number and width of the pictures for a decision."""
+# Minimum median gradient of an edge, in steps of 255 per pixel.
 _EDGE = 2.0
-"""Minimum median gradient of an edge, in steps of 255 per pixel."""
+# Largest relative difference of a frame's gradient from the median; minimum share of frames within it. Measured in
+# three real and five synthetic clips: at most half of the frames agree on a scene edge, all on the edge of a logo.
 _MAX_DEVIATION, _OFTEN = 0.5, 0.75
-"""Largest relative difference of a frame's gradient from the median; minimum share of frames within it. Measured in
-three real and five synthetic clips: at most half of the frames agree on a scene edge, all on the edge of a logo."""
+# Largest median share of frames that agree on a scene edge. Above it, the camera hardly moves, and an overlay cannot be
+# detected.
 _SCENE_OFTEN = 0.35
-"""Largest median share of frames that agree on a scene edge. Above it, the camera hardly moves, and an overlay cannot
-be detected."""
+# Largest gap between edges of one overlay, in pixels of a picture 640 wide.
 _CLOSE = 13
-"""Largest gap between edges of one overlay, in pixels of a picture 640 wide."""
+# Minimum area of an overlay in square pixels of a picture 640 wide; maximum area as a share of the picture.
 _LEAST, _MOST = 60, 0.25
-"""Minimum area of an overlay in square pixels of a picture 640 wide; maximum area as a share of the picture."""
+# Width of the border in pixels of a picture 640 wide. Parts entirely within it are dark camera borders: harmless.
 _RIM = 8
-"""Width of the border in pixels of a picture 640 wide. Parts entirely within it are dark camera borders: harmless."""
+# Dilation of the mask in pixels of a picture 640 wide, to cover blurred edges.
 _GROW = 2
-"""Dilation of the mask in pixels of a picture 640 wide, to cover blurred edges."""
 
 
 def looked_at(count: int) -> list[int]:

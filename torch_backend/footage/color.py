@@ -22,8 +22,9 @@ from ..contract import PROBE
 
 SRGB_KNEE = np.float32(0.04045)
 """Encoded value at the end of the linear segment."""
+# Derived from `SRGB_KNEE`, not the rounded 0.0031308 of the standard, so that both branches agree.
 LINEAR_KNEE = np.float32(0.04045 / 12.92)
-"""The same point in linear light; derived from `SRGB_KNEE`, not the rounded 0.0031308, so that both branches agree."""
+"""The same point in linear light."""
 
 
 def srgb_to_linear(x: ArrayLike) -> NDArray[np.float32]:
@@ -61,14 +62,14 @@ def linear_to_srgb8(x: ArrayLike) -> NDArray[np.uint8]:
 def on_straight_colour(rgba: ArrayLike, curve: Callable[[ArrayLike], NDArray[np.float32]]) -> NDArray[np.float32]:
     """Applies a curve to colour premultiplied by alpha, [..., 4]. Raises ValueError for another shape.
 
-    The curve acts on the unpremultiplied colour, so a half-covered white pixel of sRGB becomes light (0.5, 0.5, 0.5,
-    0.5), not darker. If alpha is 0 (pure emission), the curve acts on the stored colour.
+    The curve acts on the unpremultiplied colour; if alpha is 0 (pure emission), on the stored colour.
     """
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.ndim < 1 or rgba.shape[-1] != 4:
         raise ValueError(f"rgba should be [..., 4], got shape {list(rgba.shape)}")
     alpha = rgba[..., 3:4]
     weight = np.where(alpha > 0.0, alpha, np.float32(1.0))
+    # A half-covered white pixel of sRGB becomes light (0.5, 0.5, 0.5, 0.5). The curve on 0.5 itself would give 0.21.
     return np.concatenate([curve(rgba[..., :3] / weight) * weight, alpha], axis=-1)
 
 
@@ -189,6 +190,8 @@ def _power(exponent: float) -> Callable[[ArrayLike], NDArray[np.float32]]:
     return curve
 
 
+# Transfer function of pictures made for a display -> (curve to light, curve back). Except for gamma 1.8, the encoded
+# values are used as sRGB without conversion, as in players and Blender. Only their primaries are converted, in light.
 _DISPLAY = {
     "srgb": (srgb_to_linear, linear_to_srgb),
     "g18": (_power(1.8), linear_to_srgb),
@@ -196,15 +199,13 @@ _DISPLAY = {
     "g24": (_power(2.4), _power(1.0 / 2.4)),
     "g26": (_power(2.6), _power(1.0 / 2.6)),
 }
-"""Transfer function of pictures made for a display -> (curve to light, curve back). Except for gamma 1.8, the encoded
-values are used as sRGB without conversion, as in players and Blender. Only their primaries are converted, in light."""
+# Transfer function of pictures that hold light -> curve to light.
 _SCENE: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
     "lin": lambda x: x,
     "cineon": cineon_to_linear,
     "pq": pq_to_linear,
     "hlg": hlg_to_linear,
 }
-"""Transfer function of pictures that hold light -> curve to light."""
 TRANSFERS = {
     "srgb": "sRGB", "g18": "gamma 1.8", "g22": "gamma 2.2", "g24": "video", "g26": "gamma 2.6", "lin": "linear",
     "cineon": "Cineon log", "pq": "PQ", "hlg": "HLG",

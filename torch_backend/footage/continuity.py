@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 WIDTH = 320
 """Width in pixels of the compared pictures."""
 _FEATURES = 500
+# Minimum number of features for a comparison. A picture with fewer is blank or smeared.
 _LEAST_FEATURES = 40
-"""Minimum number of features for a comparison. A picture with fewer is blank or smeared."""
+# Largest error of an inlier to the homography, in pixels. It leaves room for parallax.
 _TOLERANCE = 5.0
-"""Largest error of an inlier to the homography, in pixels. It leaves room for parallax."""
+# Value added to the local contrast, in 8-bit steps, so that noise in black does not become texture.
 _FLOOR = 2.0
-"""Value added to the local contrast, in 8-bit steps, so that noise in black does not become texture."""
+# Largest ratio of the best match's distance to the second best match's distance (Lowe's ratio).
 _DISTINCT = 0.8
-"""Largest ratio of the best match's distance to the second best match's distance (Lowe's ratio)."""
 
 
 @dataclass(frozen=True)

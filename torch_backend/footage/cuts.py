@@ -25,41 +25,41 @@ DIFFERENT_SCENES = 0.13
 """Largest overlap of different scenes by SIFT features, relative to the overlap of neighbouring frames.
 Measured: 0.20 to 1.5 in the fastest parts of three handheld clips, darkened, noisy, flickering and blurred. 0.01 to
 0.083 at cuts, including cuts to mirrored pictures and to other views of one room."""
+# Minimum number of SIFT features that neighbours share, for a decision.
 _LEAST_LEVEL = 20
-"""Minimum number of SIFT features that neighbours share, for a decision."""
+# Minimum share of quick features in common with a neighbour. Noise, flashes and smeared frames have fewer.
 _LINKED = 0.15
-"""Minimum share of quick features in common with a neighbour. Noise, flashes and smeared frames have fewer."""
+# Ratio of a frame's sharpness to the median of its take, below which the frame is smeared.
 _SHARP = 0.4
-"""Ratio of a frame's sharpness to the median of its take, below which the frame is smeared."""
+# Number of frames for the median sharpness of a take.
 _WINDOW = 8
-"""Number of frames for the median sharpness of a take."""
+# Minimum number of frames for the median sharpness of a take.
 _LEAST_TAKE = 3
-"""Minimum number of frames for the median sharpness of a take."""
+# Share of quick features that unrelated pictures may have in common, with a margin: measured up to 0.04.
 _UNRELATED = 0.06
-"""Share of quick features that unrelated pictures may have in common, with a margin: measured up to 0.04."""
+# Largest shift of the picture, as a share of its width, at which two frames around a third one must overlap.
 _NEAR = 0.2
-"""Largest shift of the picture, as a share of its width, at which two frames around a third one must overlap."""
+# Largest ratio for a wipe: matches between the frames before and after, over the fewer of the mixed frame's matches
+# with either. Measured: 0.04 and 0.05; 0.15 if somebody walks past, 0.29 and more in handheld clips with noise.
 _WIPED = 0.1
-"""Largest ratio for a wipe: matches between the frames before and after, over the fewer of the mixed frame's matches
-with either. Measured: 0.04 and 0.05; 0.15 if somebody walks past, 0.29 and more in handheld clips with noise."""
+# The limit of `_WIPED` for a dissolve, which has uncertain matches but must also be a sum of the two pictures.
 _MIXED = 0.4
-"""The limit of `_WIPED` for a dissolve, which has uncertain matches but must also be a sum of the two pictures."""
+# Minimum number of SIFT features to align the two pictures of a dissolve with the frame between.
 _LEAST_COMMON = 10
-"""Minimum number of SIFT features to align the two pictures of a dissolve with the frame between."""
+# Minimum share of a dissolved frame's variance that the sum of the two pictures explains.
 _EXPLAINED = 0.85
-"""Minimum share of a dissolved frame's variance that the sum of the two pictures explains."""
+# Minimum factor by which the sum reduces the residual of either picture alone. Measured: 2.2 to 8 in dissolves over 4
+# to 30 frames; often more within one take, see `_SAME_SCENE`.
 _GAINED = 2.2
-"""Minimum factor by which the sum reduces the residual of either picture alone. Measured: 2.2 to 8 in dissolves over 4
-to 30 frames; often more within one take, see `_SAME_SCENE`."""
+# Correlation of the two aligned pictures above which they show the same scene. Measured: 0.41 to 0.55 in dissolves,
+# 0.74 and more within one take, where the mean of two neighbours also explains the frame between.
 _SAME_SCENE = 0.65
-"""Correlation of the two aligned pictures above which they show the same scene. Measured: 0.41 to 0.55 in dissolves,
-0.74 and more within one take, where the mean of two neighbours also explains the frame between."""
+# Minimum weight of either picture in the sum. The weights add up to about 1.
 _LEAST_PART = 0.25
-"""Minimum weight of either picture in the sum. The weights add up to about 1."""
+# Minimum difference in stops between the darkest or brightest frame of a fade and both takes.
 _FADED_STOPS = 2.0
-"""Minimum difference in stops between the darkest or brightest frame of a fade and both takes."""
+# Minimum change in stops from one frame of a fade to the next.
 _FADING = 0.1
-"""Minimum change in stops from one frame of a fade to the next."""
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,11 @@ import av
 import av.filter
 from av.error import FFmpegError
 
+# Number of frames examined for combing, at each of two places.
 _PROBED = 40
-"""Number of frames examined for combing, at each of two places."""
+# Minimum share of combed frames in an interlaced clip. Share that idet reported as combed: none in three progressive
+# clips, nine of ten in an interlaced clip, two of five in film on tape (3:2).
 _COMBED_SHARE = 0.2
-"""Minimum share of combed frames in an interlaced clip."""
 
 
 @dataclass
@@ -42,8 +43,7 @@ def unmarked_fields(container: Any, stream: Any) -> str:
     """Field order ("tff", "bff") of frames that are combed but not marked as interlaced; else empty.
 
     Runs FFmpeg's idet filter at the beginning and in the middle. A frame woven from two fields of different instants
-    shows combing at moving edges. Share of frames that idet reported as combed: none in three progressive clips, nine
-    of ten in an interlaced clip, two of five in film on tape (3:2).
+    shows combing at moving edges.
     """
     combed: Counter[str] = Counter()
     for spot in (0.0, 0.5):
@@ -97,8 +97,7 @@ def stored_frames(
 def _packets(container: Any, stream: Any) -> Iterator[Any]:
     """Packets of a stream, then an empty packet, which flushes the decoder. An error ends the file early.
 
-    Omits a truncated packet at the end of the file. It holds half a picture, and its error would discard the frames
-    still in the decoder.
+    Omits a truncated packet at the end of the file.
     """
     packets: Iterator[Any] = container.demux(stream)
     pending: Any = None
@@ -111,6 +110,7 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
         if packet is not None and not packet.size and packet.dts is not None:
             continue  # in an AVI, a repeat of the previous frame; a decoder would read it as the end
         at_end = packet is None or not packet.size
+        # A truncated last packet holds half a picture. Its error would discard the frames still in the decoder.
         if pending is not None and not (at_end and pending.is_corrupt):
             yield pending
         if at_end:
@@ -125,13 +125,13 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
 def _deinterlaced(frames: Iterator[Any], noticed: Noticed, fields: str) -> Iterator[Any]:
     """Deinterlaces frames by FFmpeg's bwdif, from the first interlaced frame on. Keeps the number of frames.
 
-    The filter does not change progressive frames. With `fields` ("tff" or "bff"), all frames count as interlaced. The
-    filter looks one frame ahead, so it is flushed before an error or a change of size.
+    The filter does not change progressive frames. With `fields` ("tff" or "bff"), all frames count as interlaced.
     """
     graph: av.filter.Graph | None = None
     size: tuple[int, int, str] | None = None
     for frame in frames:
         failed = isinstance(frame, FFmpegError)
+        # The filter looks one frame ahead: without a flush, that frame would come after the error or get lost.
         if graph is not None and (failed or _size(frame) != size):
             yield from _flushed(graph)
             graph = None

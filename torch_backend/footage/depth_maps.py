@@ -22,12 +22,12 @@ from .pairing import counted_of, pair, pairing_words
 from .sequence_files import find_sequence
 from .sources import footage_error, frame_words
 
+# Smallest value that means "no depth": Blender writes 1e10, other programs 1e30 or infinity.
 _FARTHEST = 1e9
-"""Smallest value that means "no depth": Blender writes 1e10, other programs 1e30 or infinity."""
+# Relative tolerance of a map's aspect ratio: networks round sides to multiples of 14 or 32 pixels.
 _SHAPE = 0.04
-"""Relative tolerance of a map's aspect ratio: networks round sides to multiples of 14 or 32 pixels."""
+# Largest difference of red, green and blue in a grey picture, in 0..1: half a step of 8 bits.
 _GREY = 1.0 / 512.0
-"""Largest difference of red, green and blue in a grey picture, in 0..1: half a step of 8 bits."""
 
 
 class UnusableMap(Exception):

@@ -8,8 +8,7 @@ encoding adds a shoulder to the extended sRGB curve s, from 0.8 on:
 The slope at 0.8 is continuous, and light 64 lies just below 1. Between light 0.6 and 64, half a step of 16 bits is at
 most 4e-4 of the light; half a step of 8 bits is up to a tenth of it.
 
-Code that resamples such pictures (resizing, undistortion) does so in extended sRGB, as for plates. With the shoulder, a
-kernel that rings by a twentieth would make the rim of a lamp three times as bright.
+Code that resamples such pictures (resizing, undistortion) does so in extended sRGB, as for plates.
 """
 
 from __future__ import annotations
@@ -83,6 +82,8 @@ class Display:
         """
         if not self.bends:
             raise ValueError("a display without a shoulder cannot show scene-linear light")
+        # Resize before the shoulder: after it, a kernel that rings by a twentieth would triple the light of a lamp's
+        # rim.
         small = plate_encoding.resize_plate(plate, width, height)
         out = np.empty(small.shape, np.uint16)
         for top in range(0, height, plate_encoding.ROWS):

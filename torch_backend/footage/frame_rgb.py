@@ -28,8 +28,8 @@ MATRIX_OVERRIDES = {"bt709": BT709, "bt601": BT601, "bt2020": 9}
 """Value of --matrix -> the scaler's matrix."""
 RANGE_OVERRIDES = {"video": VIDEO_RANGE, "full": FULL_RANGE}
 
+# The scaler's 16-bit output for white in video range: 65536 * 255 / 256.
 _WHITE16_OF_VIDEO_RANGE = 65280
-"""The scaler's 16-bit output for white in video range: 65536 * 255 / 256."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,7 @@ def depth_of(frame: av.VideoFrame) -> int:
 def rgb_codes(frame: av.VideoFrame, coding: Coding, *, deep: bool) -> NDArray[Any]:
     """R'G'B' [H, W, 3], uint8, or uint16 if `deep`: black is 0, white the largest code."""
     if _is_grey(frame):
+        # The scaler always treats grey as full range.
         return _grey_codes(frame, coding, deep=deep)
     pixels: NDArray[Any] = _scaled(frame, coding, "rgb48le" if deep else "rgb24").to_ndarray()
     if not deep or coding.matrix == RGB:
@@ -154,7 +155,7 @@ def _is_grey(frame: av.VideoFrame) -> bool:
 
 
 def _grey_codes(frame: av.VideoFrame, coding: Coding, *, deep: bool) -> NDArray[Any]:
-    """R'G'B' from luma only. Bypasses the scaler, which always treats grey as full range."""
+    """R'G'B' from luma only."""
     bits = depth_of(frame)
     plane = frame.planes[0]
     big = frame.format.name.endswith("be")

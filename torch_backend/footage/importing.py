@@ -115,7 +115,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
                 report.warning(message, hint)
             record |= _marked(shot, record, fresh, report)
             write_json(fresh / FRAMES_FILE, record)
-            write_json(fresh / UNPUBLISHED_FILE, _news(record, source) | order)
+            write_json(fresh / UNPUBLISHED_FILE, _news(record, source) | order)  # takes effect together with the frames
             keep_foreign_files(shot.frames, fresh, record)
     except SamePictures:
         report.progress("import", 1, 1, "already imported")
@@ -127,9 +127,9 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     return _result(shot, record)
 
 
+# Settings that are always part of the key. Others only count if not at their default, so that a new option does not
+# invalidate finished imports.
 _ALWAYS_IN_THE_KEY = ("first", "last", "step", "working_height", "fps")
-"""Settings that are always part of the key. Others only count if not at their default, so that a new option does not
-invalidate finished imports."""
 
 
 def display_for(info: SourceInfo) -> Display:
@@ -450,10 +450,11 @@ def _report_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], rep
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:
-    """A working frame in grey, at most `WIDTH` wide: 48 full frames in 4K would take 400 MB."""
+    """A working frame in grey, at most `WIDTH` wide."""
     pixels = read_frame(path)
     pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    # 48 full frames in 4K would take 400 MB.
     if grey.shape[1] > WIDTH:
         grey = cv2.resize(
             grey, (WIDTH, max(1, round(grey.shape[0] * WIDTH / grey.shape[1]))), interpolation=cv2.INTER_AREA
@@ -468,7 +469,7 @@ def _displayed(info: SourceInfo, measures: list[FrameMeasures]) -> dict[str, Any
 
 
 def _news(record: dict[str, Any], source: str) -> dict[str, Any]:
-    """Changes to shot.json. Stored beside the new frames, so that both take effect at the same moment."""
+    """Changes to shot.json by a new import."""
     frames = record["frames"]
     imported = {name: record[name] for name in ("step", "fps", "width", "height", "colour")}
     return {"source": str(source), "first": frames[0]["frame"], "last": frames[-1]["frame"], **imported}

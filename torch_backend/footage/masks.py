@@ -34,15 +34,15 @@ from .sources import footage_error, frame_words
 from .video import VideoSource
 
 _HALF = 0.5
+# Relative tolerance of a mask's aspect ratio, because sizes are rounded.
 _SHAPE = 0.01
-"""Relative tolerance of a mask's aspect ratio, because sizes are rounded."""
+# Maximum number of pixels of a mask that is larger than the footage. As floats, it takes 0.5 GB.
 _MOST_PIXELS = 1 << 25
-"""Maximum number of pixels of a mask that is larger than the footage. As floats, it takes 0.5 GB."""
+# Largest covered share of the picture at which a solve is possible.
 _ALL = 0.98
-"""Largest covered share of the picture at which a solve is possible."""
+# A colour is a matte itself if the share `_MATTE` of its pixels is within `_BLACK` of black or white, with some of
+# both.
 _BLACK, _MATTE = 0.1, 0.95
-"""A colour is a matte itself if the share `_MATTE` of its pixels is within `_BLACK` of black or white, with some of
-both."""
 _BRIGHTNESS, _ALPHA, _BOTH = "brightness", "alpha", "both"
 """Channels that define the mask."""
 _Picture = tuple[int | None, NDArray[np.float32], NDArray[np.float32] | None]

@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from .av_types import side_data
 from .oiio_types import attribute
 
+# Tolerance for the elements of a display matrix: a rotation by one degree changes them by 0.017.
 _NEARLY = 0.02
-"""Tolerance for the elements of a display matrix: a rotation by one degree changes them by 0.017."""
 _WORDS = {
     2: "mirrored left to right", 3: "turned by 180 degrees", 4: "mirrored top to bottom",
     5: "mirrored along its diagonal", 6: "turned clockwise", 7: "mirrored along its other diagonal",
     8: "turned counterclockwise",
 }  # fmt: skip
+# Elements (a, b, c, d) of a display matrix with x' = a x + c y and y' = b x + d y, y downwards -> EXIF code.
 _MATRICES = {
     (1, 0, 0, 1): 1, (-1, 0, 0, 1): 2, (-1, 0, 0, -1): 3, (1, 0, 0, -1): 4,
     (0, 1, 1, 0): 5, (0, 1, -1, 0): 6, (0, -1, -1, 0): 7, (0, -1, 1, 0): 8,
 }  # fmt: skip
-"""Elements (a, b, c, d) of a display matrix with x' = a x + c y and y' = b x + d y, y downwards -> EXIF code."""
 
 
 @dataclass(frozen=True)

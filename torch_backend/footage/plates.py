@@ -35,10 +35,10 @@ PLATES_VERSION = 1
 STAYS = "Frozen frames stay at the size and depth of the working frames."
 """Last sentence of every note."""
 _KEPT, _KEPT_BYTES = 11, 150e6
+# A plate shows the picture of its working frame if the mean difference of each channel is below `_AGREE`, and the luma
+# of less than `_DISAGREE_SHARE` of the pixels differs by more than `_AGREE`.
 _AGREE = 4.0 / 255.0
 _DISAGREE_SHARE = 1e-3
-"""Test whether a plate shows the picture of its working frame: the mean difference of each channel is below `_AGREE`,
-and the luma of less than this share of pixels differs by more than `_AGREE`."""
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
@@ -163,13 +163,14 @@ class Plates:
         return self._undistorted(plate_encoding.resize_plate(picture, self.width, self.height), frame)
 
     def _undistorted(self, picture: NDArray[Any], frame: int) -> NDArray[Any]:
-        """Undistorted codes. 8-bit codes become 16-bit, because interpolated values lie between the codes."""
+        """Undistorted codes: float16 stays, integer codes become 16-bit."""
         lens = self._lenses[frame] if isinstance(self._lenses, dict) else None
         if lens is None or lens.is_none:
             return picture
         if self._warp is None or self._warp[0] != lens:
             self._warp = None  # free its memory before building the next one
             self._warp = lens, BandUndistorter(lens.where(self.width, self.height))
+        # Interpolated values lie between 8-bit codes.
         kind = np.dtype(np.float16 if picture.dtype == np.float16 else np.uint16)
         into = np.empty(picture.shape, kind)
         return self._warp[1](picture, plate_encoding.display, lambda x: plate_encoding.from_display(x, kind), into)

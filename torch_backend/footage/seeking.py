@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 from .av_types import seconds_of
 from .sources import Known, footage_error
 
+# Number of decoder threads. Each holds its own frames.
 _THREADS = 2
-"""Number of decoder threads. Each holds its own frames."""
+# Number of decoded frames kept: the next request is usually for a neighbour, forwards or backwards.
 _KEPT = 4
-"""Number of decoded frames kept: the next request is usually for a neighbour, forwards or backwards."""
+# Distance in frames up to which further decoding is faster than a seek: key frames are usually farther apart.
 _MAX_SKIP = 32
-"""Distance in frames up to which further decoding is faster than a seek: key frames are usually farther apart."""
+# Offsets in seconds before a frame at which to search for a key frame, in this order.
 _EARLIER = (0.0, 1.0, 5.0, 20.0)
-"""Offsets in seconds before a frame at which to search for a key frame, in this order."""
+# Minimum gap in seconds to distinguish frames by time: the import rounds times to 1e-6.
 _LEAST_GAP = 1e-5
-"""Minimum gap in seconds to distinguish frames by time: the import rounds times to 1e-6."""
 
 
 class DecodedVideo(Protocol):

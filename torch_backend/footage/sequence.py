@@ -48,10 +48,10 @@ from .sources import (
 DEFAULT_FPS = 24.0
 
 
+# Extensions of files that Blender shows correctly. Blender cannot read JPEG XL, and damages one line of SGI files.
 _IN_BLENDER = {
     ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
 }  # fmt: skip
-"""Extensions of files that Blender shows correctly. Blender cannot read JPEG XL, and damages one line of SGI files."""
 
 
 _NO_ORIENTATION = (

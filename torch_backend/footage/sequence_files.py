@@ -23,8 +23,8 @@ from .sources import (
 FEW = 2
 
 
+# Formats of OpenImageIO without stored pictures: null generates pictures, term writes text.
 _NO_PICTURES = {"null", "term"}
-"""Formats of OpenImageIO without stored pictures: null generates pictures, term writes text."""
 
 
 def _picture_endings() -> frozenset[str]:

@@ -52,8 +52,8 @@ from .video_stream import (
     timecode,
 )
 
+# FFmpeg formats that other programs treat as still pictures.
 _ANIMATED_PICTURES = {"apng", "gif"}
-"""FFmpeg formats that other programs treat as still pictures."""
 
 # Code points of ITU-T H.273, as stored in the stream.
 UNSAID = (0, 2, 3)
@@ -68,10 +68,10 @@ NEAR_REC709 = {4: "BT.470 M", 5: "BT.601 625", 6: "BT.601 525", 7: "SMPTE 240M",
 """Primaries of standard definition. They are read as Rec.709, as in editors and Blender: the difference is small."""
 
 
+# Maximum height of interlaced pictures in any standard, in lines.
 _MOST_INTERLACED = 1088
-"""Maximum height of interlaced pictures in any standard, in lines."""
+# (path, size, modification time) of a file -> its `decoding.unmarked_fields`.
 _fields_of: dict[tuple[str, int, int], str] = {}
-"""(path, size, modification time) of a file -> its `decoding.unmarked_fields`."""
 _NO_ORIENTATION = (
     "The clip's header asks to show the picture at an angle or stretched, but only quarter turns and mirroring are "
     "supported: frames are read as stored.",

@@ -19,8 +19,8 @@ NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", 
 """FFmpeg formats that are no clips: plain text opens as a terminal recording, and playlists refer to other files."""
 
 
+# Top-level atoms of MP4 and QuickTime files, except the index (moov).
 _ATOMS = {b"ftyp", b"mdat", b"free", b"skip", b"wide", b"uuid", b"pnot", b"moof", b"sidx", b"styp", b"meta"}
-"""Top-level atoms of MP4 and QuickTime files, except the index (moov)."""
 
 
 def _lacks_index(path: Path) -> bool:
@@ -95,11 +95,9 @@ def streams_of(container: Any, path: Path) -> list[Any]:
 
 
 def alpha_decoder_of(stream: Any) -> str:
-    """Name of a special decoder for the alpha of a clip; empty if the default decoder suffices, or without alpha.
-
-    VP8 and VP9 store alpha as a second picture, which only Google's libvpx decoder combines with the first.
-    """
+    """Name of a special decoder for the alpha of a clip; empty if the default decoder suffices, or without alpha."""
     marked = {key.lower(): str(value) for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
+    # VP8 and VP9 store alpha as a second picture, which only Google's libvpx decoder combines with the first.
     decoder = {"vp8": "libvpx", "vp9": "libvpx-vp9"}.get(stream.codec_context.name, "")
     return decoder if marked and decoder in av.codecs_available else ""
 
@@ -130,15 +128,14 @@ def timecode(container: Any, stream: Any) -> str:
 def promise(container: Any, stream: Any, rate: Fraction) -> tuple[int, float]:
     """(number of frames, end of the last frame in seconds on the stream's clock), as announced by the file.
 
-    (0, 0) if the file announces nothing for this stream. The container's length does not count if there are several
-    streams: it may be the length of the sound.
+    (0, 0) if the file announces nothing for this stream.
     """
     start = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
     if stream.duration and stream.time_base:
         end = start + float(stream.duration * stream.time_base)
     elif stream.metadata.get("DURATION"):  # Matroska stores the end, not the length
         end = _clock(stream.metadata["DURATION"])
-    elif container.duration and len(container.streams) == 1:
+    elif container.duration and len(container.streams) == 1:  # with several streams, it may be the sound's length
         end = start + container.duration / av.time_base
     else:
         return 0, 0.0
