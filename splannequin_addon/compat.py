@@ -222,8 +222,8 @@ def new_quotient(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, value:
 
 
 def with_alpha(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, alpha: bpy.types.NodeSocket) -> Any:
-    """Socket of an image with another alpha and unchanged colours. Needed because a Mix node takes the first image's
-    alpha until 5.1, then a mix of both."""
+    """Socket of an image with another alpha and unchanged colours."""
+    # Needed after a Mix node: until 5.1 it takes the first image's alpha, then a mix of both.
     node: Any = tree.nodes.new("CompositorNodeSetAlpha")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Replace Alpha"
@@ -306,8 +306,9 @@ def combined(tree: bpy.types.NodeTree, channels: Sequence[bpy.types.NodeSocket])
 def sized(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, size: tuple[int, int]) -> Any:
     """Socket of an image scaled to a size in pixels. An image of that size is unchanged, bit by bit.
 
-    Before 4.5 it is `picture` itself, because a Scale node there changes every pixel.
+    Before 4.5 it is `picture` itself.
     """
+    # Before 4.5, a Scale node changes every pixel, also without a change of size.
     if not CROPS_WHOLE:
         return picture
     node: Any = tree.nodes.new("CompositorNodeScale")
@@ -327,25 +328,25 @@ def literal(path: str) -> str:
 
 
 def set_png(settings: bpy.types.ImageFormatSettings) -> None:
-    """Sets 8-bit RGB PNG as a scene's output format. RGB keeps holes black; RGBA would divide them by alpha."""
+    """Sets 8-bit RGB PNG as a scene's output format."""
     if hasattr(settings, "media_type"):
         settings.media_type = "IMAGE"
     settings.file_format = "PNG"
-    settings.color_mode = "RGB"
+    settings.color_mode = "RGB"  # keeps holes black, RGBA would divide them by alpha
     settings.color_depth = "8"
     settings.compression = 15
     settings.color_management = "FOLLOW_SCENE"
 
 
+# Bytes of an image file with the single pixel `PROBE`.
 _PROBE = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n" + bytes((*(int(256 * v) for v in PROBE), 128))
-"""Bytes of an image file with the single pixel `PROBE`."""
+# Usual names of these spaces in colour configurations. They are tried first, and used if no space passes the test.
 _LIKELY = {
     "linear": ("Linear Rec.709", "Linear Rec.709 (sRGB)", "lin_rec709", "Utility - Linear - sRGB", "Linear"),
     "srgb": ("sRGB", "sRGB - Texture", "sRGB Encoded Rec.709 (sRGB)", "Utility - sRGB - Texture", "sRGB EOTF"),
 }
-"""Usual names of these spaces in colour configurations. They are tried first, and used if no space passes the test."""
+# Encoding -> colour space. Cached, because the configuration is fixed when Blender starts.
 _spaces: dict[str | tuple[float, ...], str] = {}
-"""Encoding -> colour space. Cached, because the configuration is fixed when Blender starts."""
 
 
 def set_image_colour(image: bpy.types.Image, encoding: str | tuple[float, ...]) -> None:

@@ -70,7 +70,7 @@ def set_keys(
     known = _enumerated("type")
     animation: Any = datablock.animation_data_create()
     action: Any = animation.action
-    if action is None or action.library is not None:
+    if action is None or action.library is not None:  # a linked action is read-only
         action = animation.action = bpy.data.actions.new(f"{datablock.name}Action")
     if hasattr(action, "slots"):
         slot = animation.action_slot
@@ -92,7 +92,7 @@ def set_keys(
             keys.foreach_set("interpolation", np.full(len(frames), straight, dtype=np.int32))
             if any(kind != "KEYFRAME" for kind in types):
                 keys.foreach_set("type", np.array([known[kind] for kind in types], dtype=np.int32))
-            curve.update()
+            curve.update()  # `foreach_set` leaves handles and order as they were
 
 
 def remove_keys(datablock: _Animated, data_paths: Sequence[str]) -> None:

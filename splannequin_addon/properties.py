@@ -47,8 +47,8 @@ class _Declared:
         self.options = options
 
 
+# Class -> its assigned properties, which `annotate` removed from it.
 _declared: dict[type, dict[str, _Declared]] = {}
-"""Class -> its assigned properties, which `annotate` removed from it."""
 
 
 def _of(declare: Callable[P, object], kind: type[T]) -> Callable[P, T]:
@@ -101,8 +101,8 @@ def annotate(cls: type) -> None:
 
 
 def release(cls: type) -> None:
-    """Replaces the annotations by strings once Blender has read them. Otherwise the module bpy 4.2 crashes when Python
-    ends."""
+    """Replaces the annotations by strings once Blender has read them."""
     for one in cls.__mro__:
         for name, value in _declared.get(one, {}).items():
+            # With Blender's objects in them, the module bpy 4.2 crashes when Python ends.
             one.__annotations__[name] = value.declare.__name__

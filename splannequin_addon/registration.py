@@ -25,23 +25,23 @@ from .solve.step import STEP as SOLVE
 from .train.step import STEP as TRAIN
 from .ui import job_operators, menu, preferences, shots_panel
 
+# The steps in order of execution, which is also the order of their panels.
 _STEPS = (IMPORT, SOLVE, TRAIN, FREEZE, BAKE)
-"""The steps in order of execution, which is also the order of their panels."""
 _CLASSES = (
     *shots_panel.CLASSES,
     *job_operators.CLASSES,
     *(cls for step in _STEPS for cls in step.classes),
 )
+# Modules that are registered before the classes.
 _PARTS: tuple[steps.Part, ...] = (
     translations,
     settings,
     preferences,
 )
-"""Modules that are registered before the classes."""
 _PARTS_AFTER: tuple[steps.Part, ...] = (
     menu,
     render_settings,  # first, because later handlers use the output path of a file being saved
-    places,
+    places,  # before job_timer, whose load handler examines the shots
     *(part for step in _STEPS for part in step.parts),
     job_timer,
     command,
@@ -132,13 +132,11 @@ def _is_ours(thing: object) -> bool:
 
 
 def _take_tooltips_from_docstrings() -> None:
-    """Sets each class's docstring as its tooltip, on one line.
-
-    Blender would keep the source's line breaks, and would look up translations with them.
-    """
+    """Sets each class's docstring as its tooltip, on one line."""
     for kind in (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu):
         for cls in kind.__subclasses__():
             if cls.__module__.startswith(f"{__package__}.") and cls.__doc__ and "bl_description" not in vars(cls):
+                # Blender would keep the source's line breaks, and would look up translations with them.
                 cls.bl_description = " ".join(cls.__doc__.split())
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from ...torch_backend import contract
 
+# Variables of Blender's Python, which would lead the backend's Python to other modules.
 _SCRUBBED = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "PYTHONEXECUTABLE", "__PYVENV_LAUNCHER__", "VIRTUAL_ENV")
 
 
@@ -120,7 +121,8 @@ def ask(python: str, package_root: Path, *words: str) -> Question:
 
 
 def import_in_background(name: str) -> None:
-    """Imports a module in a thread, so that the main thread does not wait for the disk later."""
+    """Imports a module in a thread."""
+    # Otherwise the main thread, and so Blender's window, would wait for the disk at first use.
     threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()
 
 

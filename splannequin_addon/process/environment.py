@@ -27,24 +27,24 @@ from . import children
 SIZE = "about 1.5 GB on disk (6 GB with CUDA)"
 LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp (Apache) and what they need"
 _STATE = "setup"
+# Interval in seconds between checks of a used environment's packages. They are also checked after a set-up.
 _LOOK_SECONDS = 60.0
-"""Interval in seconds between checks of a used environment's packages. They are also checked after a set-up."""
+# Name prefix of a removed environment that is being deleted.
 _REMOVED = ".venv-removed-"
-"""Name prefix of a removed environment that is being deleted."""
 _SHOWN = 6
 
 
 def default_folder() -> Path:
-    """Default folder of the environment. The path is short, because packages nest deep and Windows limits paths to 260
-    characters."""
+    """Default folder of the environment."""
     if sys.platform == "win32":
+        # Short, because packages nest deep and Windows limits paths to 260 characters.
         return Path(os.environ.get("LOCALAPPDATA") or Path.home()) / "Splannequin"
     return Path.home() / ".splannequin"
 
 
 def sources(system: str = sys.platform) -> str:
-    """Hosts of the packages. Assumes that a graphics card is suitable: only the launcher checks it, because the check
-    would block Blender."""
+    """Hosts of the packages. Assumes that a graphics card is suitable."""
+    # Only the launcher checks the card, because the check would block Blender.
     index = contract.torch_index(system, nvidia_card(), lambda: True)
     return f"pypi.org, {urllib.parse.urlsplit(index).hostname or index}" if index else "pypi.org"
 
@@ -153,8 +153,8 @@ def is_incomplete(python: Path) -> bool:
     return state.is_dir() and ((state / contract.SETUP_BEGUN).exists() or not (state / contract.SETUP_STAMP).is_file())
 
 
+# Environment -> (time of its last check, modification time of its stamp then, changed packages).
 _seen: dict[Path, tuple[float, int, list[str]]] = {}
-"""Environment -> (time of its last check, modification time of its stamp then, changed packages)."""
 
 
 def changed(python: Path) -> list[str]:

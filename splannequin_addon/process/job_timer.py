@@ -26,11 +26,11 @@ from ..translations import tr
 from . import backend, children, jobs, steps
 
 TICK_SECONDS = 0.25
-BUDGET_SECONDS = 0.01
+BUDGET_SECONDS = 0.01  # a timer callback blocks Blender's window
 WORKING_SECONDS = 0.04
 """Interval in seconds between slices of work done in Blender."""
+# Interval in seconds between checks of the shot folder for changes.
 _LOOK_SECONDS = 1.0
-"""Interval in seconds between checks of the shot folder for changes."""
 
 
 @dataclass(frozen=True)
@@ -107,14 +107,14 @@ class Watch:
 
 
 _watches: dict[Path, Watch] = {}
+# Callbacks that the timer calls each time it examines jobs, until they return False.
 _callbacks: list[Callable[[], bool]] = []
-"""Callbacks that the timer calls each time it examines jobs, until they return False."""
+# Callbacks that are called more often than jobs are examined.
 _pulses: list[Callable[[], float | None]] = []
-"""Callbacks that are called more often than jobs are examined."""
+# Time of the next check of jobs while there are pulses, monotonic seconds.
 _jobs_next = 0.0
-"""Time of the next check of jobs while there are pulses, monotonic seconds."""
+# (the reason why there is no backend, time of that check in monotonic seconds).
 _backend: tuple[contract.JobError | None, float] = (None, 0.0)
-"""(the reason why there is no backend, time of that check in monotonic seconds)."""
 
 
 def watch_of(shot: Path) -> Watch:
@@ -139,9 +139,8 @@ def watches() -> list[Watch]:
 
 
 def backend_trouble() -> contract.JobError | None:
-    """The reason why there is no Python for the backend, or None. Cached for a few seconds, because panels ask at every
-    redraw."""
-    global _backend
+    """The reason why there is no Python for the backend, or None. Cached for a few seconds."""
+    global _backend  # cached, because panels ask at every redraw
     if not _backend[1] or time.monotonic() - _backend[1] > 5 * _LOOK_SECONDS:
         _backend = (backend.trouble(), time.monotonic())
     return _backend[0]
@@ -372,11 +371,11 @@ def _shown_state(job: jobs.Job) -> tuple[Any, ...]:
 
 
 def redraw() -> None:
-    """Redraws the sidebar of every 3D view. The view itself is not redrawn, because its scene may be heavy."""
+    """Redraws the sidebar of every 3D view."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions if area.type == "VIEW_3D" else ():
-                if region.type == "UI":
+                if region.type == "UI":  # the view itself may show a heavy scene
                     region.tag_redraw()
 
 
@@ -425,6 +424,7 @@ def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]],
             if window is None:
                 watch.notes[step] = how(scene)
                 continue
+            # In a timer, Blender's context has no window.
             with bpy.context.temp_override(window=window, scene=scene):  # pyright: ignore[reportUnknownMemberType]
                 before = settings_of(scene).t_star
                 watch.notes[step] = how(scene)
@@ -477,6 +477,7 @@ def register() -> None:
     for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
         handlers.append(_on_undo)
     if not bpy.app.background:
+        # Without `persistent`, Blender drops the timer when another file is loaded.
         bpy.app.timers.register(tick, first_interval=TICK_SECONDS, persistent=True)
 
 

@@ -22,21 +22,21 @@ from typing import Any
 from ...torch_backend import contract
 from . import children
 
+# Maximum time to wait for a job's process after its last status.
 _EXIT_SECONDS = 10.0
-"""Maximum time to wait for a job's process after its last status."""
+# Age after which a job without a status counts as never started.
 _START_SECONDS = 30.0
-"""Age after which a job without a status counts as never started."""
 _LOG_LINES = 6
+# Maximum time to read the events of a rediscovered job without interruption.
 _FIRST_LOOK_SECONDS = 1.0
-"""Maximum time to read the events of a rediscovered job without interruption."""
+# Time after a cancel request from which a second request kills the job.
 _KILL_SECONDS = 20.0
-"""Time after a cancel request from which a second request kills the job."""
+# Longer time estimates are not shown.
 _LONGEST_SECONDS = 1e7
-"""Longer time estimates are not shown."""
+# Maximum bytes read of a request. A request with a t* for each of 100,000 frames has a fifth of this size.
 _LONGEST_REQUEST = 1 << 24
-"""Maximum bytes read of a request. A request with a t* for each of 100,000 frames has a fifth of this size."""
+# Seconds without a heartbeat after which a job of an older backend counts as dead.
 _SILENT_SECONDS = 10 * contract.HEARTBEAT_SECONDS
-"""Seconds without a heartbeat after which a job of an older backend counts as dead."""
 
 
 @dataclass
@@ -174,18 +174,16 @@ def _final_status(job: Job, status: contract.Status | None) -> contract.Status |
 
 
 def is_alive(job: Job, status: contract.Status | None) -> bool:
-    """True if the job's process still works on it, or may be about to.
-
-    A process that is only stopped, for example by a sleeping computer, is alive regardless of its heartbeat. A job on
-    another computer is alive as long as it holds the shot's lock, which can be removed on that computer or by hand.
-    """
+    """True if the job's process still works on it, or may be about to."""
     if job.process is not None:
         return job.process.poll() is None
     if status is None or not status.pid:
         return _age(job.folder) < _START_SECONDS
     if status.host and status.host != contract.computer_name():
+        # A job on another computer is alive while it holds the shot's lock, which can be removed by hand.
         return _has_lock(job) or not _is_silent(job, status)
     if status.host or (status.process_started and sys.platform == "linux"):
+        # A process that is only stopped, as on a sleeping computer, has no heartbeat but is alive.
         return contract.runs_still(status.pid, status.process_started)
     return time.time() - status.heartbeat < _SILENT_SECONDS  # an older backend did not record its host
 
@@ -224,9 +222,8 @@ def _has_lock(job: Job) -> bool:
 
 
 def _is_silent(job: Job, status: contract.Status) -> bool:
-    """True if a job's heartbeat has not changed while this Blender watched. Does not rely on another computer's
-    clock."""
-    now = time.monotonic()
+    """True if a job's heartbeat has not changed while this Blender watched."""
+    now = time.monotonic()  # does not rely on the other computer's clock
     if job.beat is None or job.beat[0] != status.heartbeat:
         job.beat = (status.heartbeat, now)
     return now - job.beat[1] > _SILENT_SECONDS
@@ -400,10 +397,10 @@ class _Result:
     result: Any = None
 
 
+# Type of event -> its required fields. Events of other types are only passed on.
 _EVENT_DATA: dict[str, type] = {
     "warning": _Message, "error": _Message, "metric": _Metrics, "image": _Image, "done": _Result,
 }  # fmt: skip
-"""Type of event -> its required fields. Events of other types are only passed on."""
 
 
 def _apply_event(job: Job, event: contract.Event) -> None:
@@ -464,10 +461,10 @@ def _keep(job: Job, status: contract.Status) -> contract.Status:
 
 
 def _age(folder: Path) -> float:
-    """Age of a job in seconds, by the clock of its disk, because another computer may have created it."""
+    """Age of a job in seconds, by the clock of its disk."""
     now, created = time.time(), 0.0
     with contextlib.suppress(OSError):
-        now = contract.disk_time(folder)
+        now = contract.disk_time(folder)  # another computer may have created the job
     with contextlib.suppress(OSError):
         created = (folder / contract.REQUEST_FILE).stat().st_mtime
     return now - created

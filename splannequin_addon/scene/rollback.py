@@ -11,8 +11,9 @@ import bpy
 from .. import compat
 from ..access import settings_of
 
+# Kinds of data-blocks that this add-on creates. Users precede the data that they use.
 _KINDS = ("objects", "cameras", "meshes", "collections", "node_groups", "actions", "images", "textures")
-"""Kinds of data-blocks that this add-on creates. Users precede the data that they use."""
+# Owner -> settings that a step may change.
 _SETTINGS = {
     "render": (
         "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "fps", "fps_base",
@@ -22,7 +23,6 @@ _SETTINGS = {
     "scene": ("frame_start", "frame_end", "frame_current"),
     "layer": ("use_pass_z",),
 }  # fmt: skip
-"""Owner -> settings that a step may change."""
 
 
 @contextlib.contextmanager

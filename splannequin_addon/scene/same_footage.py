@@ -15,8 +15,8 @@ import bpy
 
 from ...torch_backend import contract
 
+# File name of an image in a sequence. As in Blender, the last number counts: `plate.v001.0005.exr` is frame 5.
 _NUMBER = re.compile(r"(.*?)(\d+|#+|@+|%0?\d*d)([^\d#@%]*)", re.DOTALL)
-"""File name of an image in a sequence. As in Blender, the last number counts: `plate.v001.0005.exr` is frame 5."""
 
 
 def shows(data: bpy.types.Image | bpy.types.MovieClip | None, footage: Iterable[Path]) -> bool:

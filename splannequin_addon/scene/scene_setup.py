@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 _BEFORE = "splannequin_settings_before"
 _OURS = "splannequin_settings_ours"
+# Settings that belong together are restored together or not at all.
 _COUPLED = (
     {"resolution_x", "resolution_y", "resolution_percentage"},
     {"pixel_aspect_x", "pixel_aspect_y"},
@@ -21,12 +22,12 @@ _COUPLED = (
     {"frame_start", "frame_end"},
     {"use_stamp_note", "stamp_note_text"},
 )
+# Owner -> settings of which each shot of a scene has its own values; the first frame precedes the last.
 _SHOTS = {
     "render": ("resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "fps",
                "fps_base"),
     "scene": ("frame_start", "frame_end"),
 }  # fmt: skip
-"""Owner -> settings of which each shot of a scene has its own values; the first frame precedes the last."""
 NEUTRAL_VIEWS = ("Standard", "Un-tone-mapped")
 """View transforms that leave colours unchanged: Blender's, and that of ACES configurations."""
 NEUTRAL_VIEW = {"look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False, "use_white_balance": False}
@@ -76,6 +77,7 @@ def fit_clip(
         _set(scene, "render", {"pixel_aspect_x": aspect[0], "pixel_aspect_y": aspect[1]})
         changes.append("Pixel aspect set to match the lens.")
     if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4 and "fps" not in excluded:
+        # Blender's rate is a whole number over `fps_base`: 23.976 is 24 / 1.001.
         whole = max(round(fps), 1)
         _set(scene, "render", {"fps": whole, "fps_base": whole / fps})
         changes.append(f"Frame rate set to {fps:g}.")
@@ -115,17 +117,17 @@ def put_back(scene: bpy.types.Scene, was: str) -> None:
 def keep_plate_colours(scene: bpy.types.Scene) -> list[str]:
     """Sets the view transform so that rendered images keep the plate's colours. Returns the changes as sentences.
 
-    Blender's default view (AgX) is designed for renders and would change every plate. Dithering adds noise to the last
-    bit. Raises JobError if the colour configuration has no such view.
+    Raises JobError if the colour configuration has no such view.
     """
     changes: list[str] = []
+    # Blender's default view (AgX) is designed for renders and would change every plate.
     if not keeps_plate_colours(scene):
         view = present(scene.view_settings)
         was, neutral = view.view_transform, _neutral(view)
         values = {name: value for name, value in NEUTRAL_VIEW.items() if hasattr(view, name)}
         _set(scene, "view", {"view_transform": neutral, **values})
         changes.append(f"View transform set from {was} to {neutral}, so that the plate keeps its colours.")
-    if scene.render.dither_intensity:
+    if scene.render.dither_intensity:  # noise in the last bit
         _set(scene, "render", {"dither_intensity": 0.0})
         changes.append("Dither set to 0, so that pixels stay exact.")
     return changes
@@ -189,7 +191,7 @@ def restore(scene: bpy.types.Scene) -> bool:
     """Restores the settings that were changed here, except those that the artist has changed since. True if there were
     any.
 
-    Settings that belong together (size, rate, range) are restored together or not at all.
+    Settings that belong together stay together, see `_COUPLED`.
     """
     stored = scene.get(_BEFORE)
     if not stored:

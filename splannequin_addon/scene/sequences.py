@@ -16,8 +16,8 @@ from .ownership import TAG
 
 Encoding = str | tuple[float, ...]
 """Encoding of a file's values, in the form that `compat.colour_space` accepts."""
+# Files that `read` and `read_numbers` have just loaded. The next load function uses them without a reload.
 _prefetched: set[str] = set()
-"""Files that `read` and `read_numbers` have just loaded. The next load function uses them without a reload."""
 
 
 def clear_prefetched() -> None:
@@ -45,10 +45,8 @@ def read_numbers(path: Path, name: str) -> None:
 
 
 def shown_size(image: bpy.types.Image, first: int, last: int, shift: int = 0) -> tuple[int, int]:
-    """Width and height of a sequence's images in a node set up by `show_sequence`; (0, 0) for multilayer images.
-
-    Blender knows no size of a sequence that no node shows.
-    """
+    """Width and height of a sequence's images in a node set up by `show_sequence`; (0, 0) for multilayer images."""
+    # Blender knows no size of a sequence that no node shows.
     reader = bpy.data.node_groups.new("Splannequin Reader", "CompositorNodeTree")
     try:
         show_sequence(reader.nodes.new("CompositorNodeImage"), image, first, last, shift)
@@ -85,8 +83,8 @@ def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = Fals
 
 
 def _make_opaque(image: bpy.types.Image, opaque: bool) -> None:
-    """Sets the alpha mode only if it differs, because each change makes Blender load the image again."""
-    if opaque and image.alpha_mode != "NONE":
+    """Makes Blender ignore an image's alpha."""
+    if opaque and image.alpha_mode != "NONE":  # each assignment loads the image again
         image.alpha_mode = "NONE"
 
 
@@ -118,6 +116,7 @@ def show_sequence(user: Any, image: bpy.types.Image, first: int, last: int, shif
     """Makes an Image node (or an image user) show file n - `shift` at scene frame n, from `first` to `last`."""
     if hasattr(user, "image"):
         user.image = image
+    # Blender shows file `frame - frame_start + 1 + frame_offset`.
     user.frame_duration = last - first + 1
     user.frame_start = first
     user.frame_offset = first - shift - 1

@@ -23,12 +23,12 @@ from ..scene.ownership import BAKES, DIGITS, MATTE_SHOT, TAG
 from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
+# Settings of a shot that are paths.
 _SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "shot_seen")
-"""Settings of a shot that are paths."""
+# Property of the scene's render settings: the output path, which may be ours.
 _OUTPUT = "filepath"
-"""Property of the scene's render settings: the output path, which may be ours."""
+# Paths of `_holders` from before the save, to be restored after it.
 _saving: list[str] = []
-"""Paths of `_holders` from before the save, to be restored after it."""
 
 
 def source_of(state: ShotState) -> str:
@@ -212,8 +212,7 @@ _HANDLERS = (
 
 
 def register() -> None:
-    """Registers the handlers. Must run before the job timer's registration, because its load handler examines the
-    shots."""
+    """Registers the handlers. Must run before the job timer's registration."""
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
 

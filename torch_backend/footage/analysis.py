@@ -88,8 +88,8 @@ def tones_of(luma: NDArray[np.float32]) -> tuple[float, float]:
 
 def looks_like_log(measures: Sequence[FrameMeasures]) -> tuple[float, float] | None:
     """Luma of the darkest and brightest tones of a clip, 0 to 1, if it looks like log footage; else None."""
-    # Camera logs encode black at 7 to 13 % and unclipped highlights below 90 %. Pictures for a display usually reach 3
-    # % and 97 % in some frame, and have twice the saturation.
+    # Camera logs encode black at 7 to 13 % and unclipped highlights below 90 %. Pictures for a display usually reach
+    # 3 % and 97 % in some frame, and have twice the saturation.
     usable = [m for m in measures if not m.flags and m.thumb.size]
     darkest = min((m.tones[0] for m in usable), default=0.0)
     brightest = max((m.tones[1] for m in usable), default=1.0)
