@@ -16,8 +16,8 @@ from bpy.app.handlers import persistent
 from ..access import library_of, settings_of
 from ..shot import scene_objects, selection
 
+# Shot folder that is being scrubbed, or None.
 _shot: Path | None = None
-"""Shot folder that is being scrubbed, or None."""
 
 
 def begin(scene: bpy.types.Scene, shot: Path) -> None:
@@ -49,8 +49,7 @@ def _hide(scene: bpy.types.Scene, shot: Path) -> None:
 
 @persistent
 def _restore(*_: object) -> None:
-    """Shows the points that `_hide` hid. Also runs before a save, because a file must never contain points that we
-    hid."""
+    """Shows the points that `_hide` hid."""
     for scene in bpy.data.scenes:
         for entry in settings_of(scene).made if not library_of(scene) else ():
             cloud = entry.points
@@ -85,6 +84,7 @@ def _handlers() -> list[tuple[Any, Any]]:
     """Pairs of (Blender's handler list, function) that are registered."""
     lists = bpy.app.handlers
     after = [lists.save_post, lists.save_post_fail, lists.undo_post, lists.redo_post, lists.load_post]
+    # A file must never contain points that we hid, so they are shown before a save and hidden again after it.
     return [(lists.save_pre, _restore), *((one, _update) for one in after)]
 
 

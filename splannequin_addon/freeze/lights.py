@@ -86,10 +86,10 @@ def _restore_world(scene: bpy.types.Scene) -> None:
 
 
 def _image(path: Path) -> bpy.types.Image:
-    """A panorama as an image data-block, reused by path. A panorama file never changes, because its name identifies its
-    content."""
+    """A panorama as an image data-block, reused by path."""
     for known in bpy.data.images:
         if known.get(TAG) and paths.same(paths.absolute(known.filepath), str(path)):
+            # Without a reload: a panorama's name identifies its content.
             return known
     compat.colour_space("linear")  # fails before anything is created if the configuration lacks the space
     image = bpy.data.images.load(contract.regular_file(path))
@@ -146,12 +146,11 @@ def _turn(facts: contract.LightFacts) -> Matrix:
 
 
 def _follow(rotation: bpy.types.NodeSocket, root: bpy.types.Object) -> None:
-    """Makes a socket of three angles follow an object's world rotation. The drivers use no Python, so they run in any
-    file."""
+    """Makes a socket of three angles follow an object's world rotation."""
     for axis in range(3):
         curve: Any = rotation.driver_add("default_value", axis)
         driver = curve.driver
-        driver.type = "SUM"
+        driver.type = "SUM"  # no Python, which Blender blocks in files that it does not trust
         variable = driver.variables.new()
         variable.type = "TRANSFORMS"
         target = variable.targets[0]

@@ -1,7 +1,7 @@
 """Blender's end of a live session of the backend: requests views and receives frames. No bpy.
 
 The child process draws (torch_backend/live.py). Two threads transfer the bytes, so that the main thread never waits for
-a pipe. The threads access only this module's plain data.
+a pipe.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import numpy as np
 from ...torch_backend import contract
 from ..process import children
 
+# Time that a closed child has to end before it is killed.
 _PATIENCE_SECONDS = 10.0
-"""Time that a closed child has to end before it is killed."""
 
 
 @dataclass
@@ -70,6 +70,7 @@ class Session:
     def begin(self, process: subprocess.Popen[bytes], log: Path) -> None:
         """Starts the threads that talk to the child. The child's messages about its end are in the file `log`."""
         self._process = process
+        # Blender's data is not thread-safe: these threads access only this module's plain data.
         threading.Thread(target=self._send, name="splannequin live out", daemon=True).start()
         threading.Thread(target=self._read, args=(log,), name="splannequin live in", daemon=True).start()
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from ...torch_backend import contract
 
+# Scan lines per ZIP chunk.
 _LINES = 16
-"""Scan lines per ZIP chunk."""
+# Channel type (uint, half, float) -> bytes per pixel.
 _SIZES = {0: 4, 1: 2, 2: 4}
-"""Channel type (uint, half, float) -> bytes per pixel."""
 
 
 def of_frame(path: Path) -> float:
@@ -74,6 +74,7 @@ def _unpacked(packed: bytes, size: int) -> np.ndarray:
     unzipped = np.frombuffer(zlib.decompressobj().decompress(packed, size), np.uint8)
     if len(unzipped) != size:
         raise ValueError("a chunk has an unexpected size")
+    # OpenEXR stores the differences of bytes, offset by 128, even bytes before odd bytes.
     steps = unzipped.copy()
     steps[1:] -= 128
     halves = np.cumsum(steps, dtype=np.uint8)

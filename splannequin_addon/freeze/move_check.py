@@ -28,12 +28,12 @@ WIDTH = 160
 """Width of the small images in pixels."""
 MOST_FRAMES = 24
 """Maximum number of frames drawn per camera, evenly spaced."""
+# Support from which a pixel does not count as a guess: half of its content was seen near t*.
 _SUPPORTED = 0.5
-"""Support from which a pixel does not count as a guess: half of its content was seen near t*."""
+# Interval between checks of the session when Blender runs without a window.
 _PAUSE_SECONDS = 0.005
-"""Interval between checks of the session when Blender runs without a window."""
+# View number in the live session. Windows use numbers from 0.
 _VIEW = -1
-"""View number in the live session. Windows use numbers from 0."""
 
 
 @dataclass(frozen=True)

@@ -279,9 +279,8 @@ def _low_pass(values: Array, period: float) -> Array:
 def _solve(diagonal: Array, one: Array, two: Array, wanted: Array) -> Array:
     """Solution x of A x = wanted [N, C], by L D L^T. A is symmetric positive definite with the diagonals [N], [N-1],
     [N-2].
-
-    Does not use LAPACK: see `axes.camera_to_world`.
     """
+    # Without LAPACK, whose threads block Blender's main thread on a busy machine (see `axes.camera_to_world`).
     count = len(diagonal)
     d, low, lower = np.zeros(count), np.zeros(count), np.zeros(count)
     result = np.array(wanted, dtype=np.float64)

@@ -61,6 +61,7 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
     try:
         mesh.vertices.add(len(columns["x"]))
         for attribute in attributes(columns):
+            # Until the next step an undo may free the data, and a kept reference would crash Blender.
             del mesh
             yield None
             mesh = present(named(bpy.data.meshes, called))  # an undo may have removed it
@@ -203,7 +204,7 @@ def import_natively(
     switches |= {name: False for name in ("apply_unit_conversion_scale",) if name in compat.usd_import_options()}
     bpy.ops.wm.usd_import(filepath=contract.regular_file(file, contract.LONGEST_CHECKPOINT), **switches)
     fresh = [item for item in bpy.data.objects if item.session_uid not in known]
-    bpy.context.view_layer.update()
+    bpy.context.view_layer.update()  # computes `matrix_world` of new objects
     filled = [(item, item.matrix_world.copy()) for item in fresh if item.data is not None]
     for item, matrix in filled:  # the stage's hierarchy is not needed under the root
         item.parent = None

@@ -13,12 +13,13 @@ from ...torch_backend import contract
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Data of a mesh, including its edges. Blender would need a second to compute the edges of a large mesh."""
+    """Data of a mesh."""
 
     places: np.ndarray
     """[V, 3] float32."""
     colors: np.ndarray
     """[V, 4] float32 in 0..1, display-referred."""
+    # Blender would need a second to compute the edges of a large mesh.
     edges: np.ndarray
     """[E, 2] int32, vertex indices of each edge."""
     corners: np.ndarray

@@ -77,7 +77,7 @@ def fit_clip(
         _set(scene, "render", {"pixel_aspect_x": aspect[0], "pixel_aspect_y": aspect[1]})
         changes.append("Pixel aspect set to match the lens.")
     if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4 and "fps" not in excluded:
-        # Blender's rate is a whole number over `fps_base`: 23.976 is 24 / 1.001.
+        # Blender's rate is a whole number over `fps_base`: 23.976 is about 24 / 1.001.
         whole = max(round(fps), 1)
         _set(scene, "render", {"fps": whole, "fps_base": whole / fps})
         changes.append(f"Frame rate set to {fps:g}.")

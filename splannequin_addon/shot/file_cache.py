@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+# Maximum number of cached results, enough for the runs and takes of a few shots.
 _MOST = 512
-"""Maximum number of cached results, enough for the runs and takes of a few shots."""
 _known: OrderedDict[tuple[Any, ...], tuple[tuple[int, ...], Any]] = OrderedDict()
 
 

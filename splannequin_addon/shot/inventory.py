@@ -71,6 +71,7 @@ def read(folder: Path) -> ShotState:
     state.takes = _named(_Take, paths.takes, contract.TAKE_FILE, state.damaged["take"])
     for name, take in state.takes.items():
         folder_of = contract.TakeFolder(paths.takes / name)
+        # With the time of take.json as a key: the folder's own time may not change.
         take["frame_count"] = file_cache.of(folder_of.root, _frame_count, _mtime(folder_of.facts))
         take["mattes"] = mattes(folder_of)
     return state
@@ -209,8 +210,7 @@ def _digests(path: Path) -> dict[int, str]:
 
 
 def _frame_count(take: Path, modified: float) -> int:
-    """Number of frames in a take's folder. `modified` is the time of take.json; it is part of the cache key, because
-    the folder's own time may not change."""
+    """Number of frames in a take's folder. `modified`, the time of take.json, is only a part of the cache key."""
     with os.scandir(take) as entries:
         return sum(1 for entry in entries if entry.name.endswith(contract.LAYERS))
 
@@ -350,12 +350,12 @@ def _validated(kind: type, data: dict[str, Any]) -> dict[str, Any]:
 
 
 _MOST_SENTENCES = 4
+# Limit of Blender's integers.
 _LARGEST = 1 << 31
-"""Limit of Blender's integers."""
+# Files in the folders of runs and takes that the panel reports on.
 _REPORTED_FILES = (contract.SUMMARY_FILE, contract.CHECKPOINT_FILE, contract.EXTENSION_FILE, contract.TAKE_FILE)
-"""Files in the folders of runs and takes that the panel reports on."""
+# Maximum bytes read of a run's metrics, enough for 100,000 measurements.
 _LONGEST_HISTORY = 1 << 24
-"""Maximum bytes read of a run's metrics, enough for 100,000 measurements."""
 
 
 def _named(kind: type, folder: Path, file: str, damaged: dict[str, str]) -> dict[str, dict[str, Any]]:

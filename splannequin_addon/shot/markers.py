@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     import bpy
 
 NAME = "t*"
+# `session_uid` of a scene -> (frame of the marker, t*) when the two last agreed.
 _known: dict[int, tuple[int, int]] = {}
-"""`session_uid` of a scene -> (frame of the marker, t*) when the two last agreed."""
 
 
 def toggle(scene: bpy.types.Scene) -> bool:

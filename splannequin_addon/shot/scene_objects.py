@@ -1,8 +1,4 @@
-"""Objects that were added to a scene for a shot, stored as pointers in the scene.
-
-A tag on an object would be copied with it: an artist's duplicate would count as ours and be removed. A pointer follows
-one object through renaming, undo, saving and a full copy of the scene.
-"""
+"""Objects that were added to a scene for a shot, stored as pointers in the scene."""
 
 from __future__ import annotations
 
@@ -32,6 +28,8 @@ class SPLANNEQUIN_PG_surface(bpy.types.PropertyGroup):
     object = PointerProperty(name="Object", description="A part of the take's surface", type=bpy.types.Object)
 
 
+# A tag on an object would be copied with it: an artist's duplicate would count as ours and be removed. A pointer
+# follows one object through renaming, undo, saving and a full copy of the scene.
 class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     """What there is of one shot; its name is the shot's."""
 
@@ -77,7 +75,8 @@ def name_of(shot: Path) -> str:
 
 
 def of(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made | None:
-    """The entry of a shot's objects, or None. Never writes, because it is called while drawing."""
+    """The entry of a shot's objects, or None."""
+    # Panels call this while drawing, when Blender forbids writes.
     for entry in settings_of(scene).made:
         if entry.name != name_of(shot):
             continue
@@ -128,7 +127,8 @@ def restore_camera(scene: bpy.types.Scene) -> None:
 
 
 def tidy(scene: bpy.types.Scene) -> None:
-    """Clears pointers to objects that the artist deleted. The pointers would keep them invisibly in the file."""
+    """Clears pointers to objects that the artist deleted."""
+    # The pointers would keep deleted objects invisibly in the file.
     before = settings_of(scene).camera_before
     if before is not None and not _is_in_scene(before, [scene.objects]):
         settings_of(scene).camera_before = None
@@ -149,10 +149,8 @@ def tidy(scene: bpy.types.Scene) -> None:
 
 
 def _is_in_scene(item: bpy.types.Object, collections: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:
-    """True if any scene has an object. Searches by name in the collections `collections` first.
-
-    Called at every tick. `users_scene` copies the list of all objects of every scene, which may be tens of thousands.
-    """
+    """True if any scene has an object. Searches by name in the collections `collections` first."""
+    # Called at every tick: `users_scene` copies the object list of every scene, which may be tens of thousands long.
     return any(named(objects, item.name) == item for objects in collections) or bool(item.users_scene)
 
 

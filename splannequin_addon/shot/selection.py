@@ -22,14 +22,14 @@ from ..scene import paths, scene_setup
 from . import scene_objects, source
 from .shot_state import ShotState
 
+# Data path of the only setting that can have keyframes.
 _T_STAR = "splannequin.t_star"
-"""Data path of the only setting that can have keyframes."""
+# Properties of a list item that are not settings of a shot.
 _NOT_SETTINGS = ("rna_type", "name", "scene_settings")
-"""Properties of a list item that are not settings of a shot."""
 _LOOK_SECONDS = 1.0
 _switching = False
+# Clip -> (time of the lookup in monotonic seconds, shot folder).
 _clip_folders: dict[Path, tuple[float, Path]] = {}
-"""Clip -> (time of the lookup in monotonic seconds, shot folder)."""
 
 
 def names() -> list[str]:
@@ -49,7 +49,8 @@ def folder_of(one: OneShot) -> Path | None:
 
 
 def folder_of_clip(clip: Path) -> Path:
-    """Cached `contract.default_shot_folder`, looked up once a second, because it is called at every redraw."""
+    """Cached `contract.default_shot_folder`, looked up once a second."""
+    # Every redraw of the panel calls this.
     found = _clip_folders.get(clip)
     if found is None or time.monotonic() - found[0] > _LOOK_SECONDS:
         found = _clip_folders[clip] = (time.monotonic(), contract.default_shot_folder(clip, source.is_of))
@@ -154,6 +155,7 @@ def is_switching() -> bool:
 def _copy(origin: OneShot, target: OneShot) -> None:
     """Copies the settings of a shot. Unset properties stay unset."""
     global _switching
+    # Assignments call the settings' update functions, which must not react as to the artist's edits.
     _switching = True
     try:
         for name in names():
