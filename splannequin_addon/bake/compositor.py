@@ -25,13 +25,13 @@ from . import fitting, freeze_group, group_inside, original_plate, placing, warp
 from .node_names import GAP, GROUP_NAME
 from .take_files import Take
 
+# Tag value of our Render Layers node, which is not part of the plate's stream.
 _CG = "cg"
-"""Tag value of our Render Layers node, which is not part of the plate's stream."""
+# Property of the plate's Scale node: the fit that we set last. A fit set by the artist stays until the plate or the
+# scene changes shape.
 _FIT_MODE = "splannequin_how"
-"""Property of the plate's Scale node: the fit that we set last. A fit set by the artist stays until the plate or the
-scene changes shape."""
+# Layers of every frozen frame. Other layers of the table exist only in some takes.
 _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
-"""Layers of every frozen frame. Other layers of the table exist only in some takes."""
 
 
 def insert(
@@ -117,10 +117,9 @@ def _placed(
 
 
 def _require_local(tree: bpy.types.NodeTree | None) -> None:
-    """Raises JobError if the compositor is linked from another file: changes would be lost when this file is
-    reopened."""
+    """Raises JobError if the compositor is linked from another file."""
     library = library_of(tree) if tree is not None else None
-    if library is not None:
+    if library is not None:  # changes would be lost when this file is reopened
         raise contract.JobError(
             f"This compositor is linked from {Path(bpy.path.abspath(library.filepath)).name}.",
             "Make it local first.",
@@ -240,13 +239,14 @@ def remove(scene: bpy.types.Scene) -> bool:
 
 
 def prefetch(take: Take, plate: Path | None = None, warp: bool = False) -> Iterator[None]:
-    """Loads the images that `insert` needs, one per iteration. Blender's window is blocked while it loads an image."""
+    """Loads the images that `insert` needs, one per iteration."""
     wanted: list[tuple[Path, str, sequences.Encoding]] = [
         (numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", take.light)
     ]
     if warp and any(take.plate_size):
         wanted.append(_warp_picture(take))
     for path, name, encoding in wanted:
+        # Blender's window is blocked while it loads an image, so the timer gets a turn after each.
         sequences.read(path, name, encoding, take.first, take.last)
         yield
     if plate is not None:
@@ -293,7 +293,8 @@ def _show_plate(
 
 
 def _stream_of(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> list[bpy.types.Node]:
-    """Our nodes of the plate's stream. Copies of them carry the same tag, so nodes upstream of the group come first."""
+    """Our nodes of the plate's stream, those upstream of the group first."""
+    # An artist's copies of our nodes carry the same tag.
     marked = [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]
     sources = placing.upstream(node)
     return sorted(marked, key=lambda n: n not in sources)

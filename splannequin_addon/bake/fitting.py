@@ -16,6 +16,7 @@ from .node_names import GAP
 
 def across(group: bpy.types.NodeTree) -> bpy.types.NodeSocket:
     """Socket of a value that rises from 0 at the left edge of the frame to 1 at the right edge."""
+    # A scaled image would do in every version, but Blender 4.3 leaves its lowest row unset. 5.0 has no texture node.
     if compat.HAS_TEXTURE_NODE:
         node: Any = group.nodes.new("CompositorNodeTexture")
         node.texture = _blend()
@@ -38,14 +39,14 @@ def across(group: bpy.types.NodeTree) -> bpy.types.NodeSocket:
 
 RAMP = "Splannequin Ramp"
 _STEPS, _ROWS = 1024, 32
+# Layers with more than one channel.
 _WIDE = {layer.name for layer in contract.FRAME_LAYERS if len(layer.channels) > 1}
-"""Layers with more than one channel."""
+# Size of the ramp relative to the frame.
 _BEYOND = 1.1
-"""Size of the ramp relative to the frame."""
 
 
 def _blend() -> bpy.types.Texture:
-    """A texture that rises from left to right. Blender 4.3 leaves the lowest row of a scaled image unset."""
+    """A texture that rises from left to right."""
     texture = next((t for t in bpy.data.textures if t.get(TAG) and t.type == "BLEND"), None)
     if texture is None:
         texture = bpy.data.textures.new(RAMP, "BLEND")
@@ -54,7 +55,7 @@ def _blend() -> bpy.types.Texture:
 
 
 def _ramp() -> bpy.types.Image:
-    """An image that rises from 0 at the left edge of the frame to 1 at the right. Blender 5.0 has no node for this."""
+    """An image that rises from 0 at the left edge of the frame to 1 at the right."""
     image = next((i for i in bpy.data.images if i.get(TAG) and i.name.startswith(RAMP)), None)
     if image is not None:
         return image
@@ -110,8 +111,8 @@ def fit_mode(scene: bpy.types.Scene, size: tuple[int, int]) -> str:
 
 
 def _whole(group: bpy.types.NodeTree, layer: bpy.types.NodeSocket) -> bpy.types.NodeSocket | None:
-    """Socket of 1 wherever a layer has pixels. None where Blender does not fade out the border of a scaled image."""
-    if compat.HAS_COMPOSITING_GROUP:
+    """Socket of 1 wherever a layer has pixels. None if it is not needed."""
+    if compat.HAS_COMPOSITING_GROUP:  # there, the border of a scaled image does not fade out
         return None
     node = compat.new_math_node(group, "GREATER_THAN")
     node.inputs[1].default_value = -1.0

@@ -104,9 +104,9 @@ def set_depth_scale(scene: bpy.types.Scene, scale: float) -> None:
 def single_user_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     """The scene's compositor tree. Afterwards no other scene shares this tree or our group.
 
-    A copied scene shares our group, and since Blender 5.0 a linked copy shares the whole tree. A change for one scene
-    would change the other, so shared data is copied. The scene must have a tree.
+    Shared data is copied. The scene must have a tree.
     """
+    # A copied scene shares our group, and since Blender 5.0 a linked copy shares the whole tree.
     tree = compat.single_user_compositor_tree(scene)
     nodes = [n for n in tree.nodes if isinstance(n, bpy.types.CompositorNodeGroup) and _is_ours(n.node_tree)]
     for group in {present(n.node_tree) for n in nodes}:
@@ -128,11 +128,11 @@ _FACTORS = (
     ("Only Supported", 0.0, "1: the input image is shown where the frozen frame is guessed"),
     ("Only Moving", 0.0, "1: the input image is shown where nothing moves in the footage"),
 )
+# Factors that only takes with detail support.
 _LOOKS = (
     ("Splat", 0.0, "1: only the splats, before pixels from the plates are added"),
     (INVENTED, 0.0, "1: areas from splats are tinted, areas from a plate are not"),
 )
-"""Factors that only takes with detail support."""
 _SOFTNESS_TIP = (
     "Distance in scene units around a frozen surface over which objects fade from front to back, for "
     "hair, smoke and contacts. 0: a hard edge"
@@ -202,7 +202,8 @@ def update_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list
 
 
 def set_defaults(node: bpy.types.CompositorNodeGroup, names: set[str]) -> None:
-    """Sets the named inputs of our node to their defaults: a node does not always inherit its group's defaults."""
+    """Sets the named inputs of our node to their defaults."""
+    # A node does not always inherit its group's defaults.
     for name, value, _ in (*_FACTORS, *_LOOKS):
         if name in names:
             set_value(node.inputs[name], value)

@@ -12,18 +12,16 @@ from . import fitting, warp_nodes
 from .node_names import AS_WARP, DEPTH, FROZEN, GAP, GRAIN, INVENTED, SOFTNESS
 from .take_files import Take
 
+# Depths of CG from this value on mean that the pixel shows no surface.
 _NOTHING = 0.1 * contract.NO_DEPTH
-"""Depths of CG from this value on mean that the pixel shows no surface."""
+# Tolerances as fractions of the frozen depth. CG up to `_EVEN` behind the frozen surface counts as in front. Over a
+# further `_SOFT` it fades behind. `_EVEN` is the median error of frozen depth on truth (docs/benchmarks.md, "Depth").
+# Without this tolerance, the frozen surface shows through objects that stand on it: through a quarter of their rims and
+# a twelfth of their shadows.
 _EVEN, _SOFT = 0.005, 0.01
-"""Tolerances as fractions of the frozen depth. CG up to `_EVEN` behind the frozen surface counts as in front. Over a
-further `_SOFT` it fades behind.
-
-`_EVEN` is the median error of frozen depth on truth (docs/benchmarks.md, "Depth"). Without this tolerance, the frozen
-surface shows through objects that stand on it: through a quarter of their rims and a twelfth of their shadows.
-"""
+# Fraction of its depth by which a caught shadow (black CG) counts as nearer. A take's surface mesh lies up to 3 %
+# behind its frames (docs/benchmarks.md, "The frozen scene as a mesh"), which left holes in shadows.
 _SHADOW = 0.05
-"""Fraction of its depth by which a caught shadow (black CG) counts as nearer. A take's surface mesh lies up to 3 %
-behind its frames (docs/benchmarks.md, "The frozen scene as a mesh"), which left holes in shadows."""
 
 
 def fill(
@@ -102,8 +100,8 @@ def _warped(
     return mixed
 
 
+# Colour of the tint for invented pixels, and its strength where no pixel comes from a plate.
 _TINT, _TINTED = (1.0, 0.0, 0.4, 1.0), 0.6
-"""Colour of the tint for invented pixels, and its strength where no pixel comes from a plate."""
 
 
 def _looked_at(
@@ -169,10 +167,8 @@ def _insert_cg(
 
 
 def _cg_depth(group: bpy.types.NodeTree, enter: bpy.types.Node) -> bpy.types.NodeSocket:
-    """Socket of the depth of CG. Pixels without a depth use the nearest depth of their neighbours.
-
-    A pixel that CG covers partly often has the depth of the empty background.
-    """
+    """Socket of the depth of CG. Pixels without a depth use the nearest depth of their neighbours."""
+    # A pixel that CG covers partly often has the depth of the empty background.
     around = compat.new_nearest_node(group)
     group.links.new(enter.outputs["CG Depth"], around.inputs[0])
     # Where the pixel has a depth, the neighbours' depth is raised so far that the minimum keeps the pixel's depth.

@@ -142,10 +142,8 @@ def insert_freeze(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | No
 
 
 def timecode_note(state: ShotState) -> str:
-    """Timecode note for the metadata of rendered files; empty if the footage has no timecode.
-
-    Blender's Time stamp counts from frame 0 and supports no other start.
-    """
+    """Timecode note for the metadata of rendered files; empty if the footage has no timecode."""
+    # Blender's own Time stamp counts from frame 0 and supports no other start.
     first = state.frame_range[0]
     code = state.timecode_at(first)
     return f"Timecode {code} at frame {first}, {state.info['fps']:g} fps." if code else ""

@@ -27,8 +27,8 @@ LENS = "Splannequin Undistort"
 LIGHT = "Splannequin Working Light"
 """Name of the group that restores the highlights of working frames."""
 _LENS_TAG = "splannequin_lens"
+# Name of the node that shows the ST map, in the group `LENS`.
 _MAP = "ST Map"
-"""Name of the node that shows the ST map, in the group `LENS`."""
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,14 @@ from ..process.job_timer import Progress, Work
 from ..scene import session
 from . import render_settings, rendering
 
+# Number of timer turns without a render job after which a render counts as over, even without an end handler. The first
+# turn may come before the render job starts.
 _IDLE_TURNS = 2
-"""Number of timer turns without a render job after which a render counts as over, even without an end handler. The
-first turn may come before the render job starts."""
+# Shot -> its running render.
 _runs: dict[Path, rendering.Run] = {}
-"""Shot -> its running render."""
+# Shot -> whether its render was cancelled, set by the handlers at the end of a render. The timer restores the scene,
+# because handlers of a window's render run in a separate thread.
 _ended: dict[Path, bool] = {}
-"""Shot -> whether its render was cancelled, set by the handlers at the end of a render.
-
-The timer restores the scene, because handlers of a window's render run in a separate thread.
-"""
 
 
 def began(shot: Path, run: rendering.Run) -> None:

@@ -23,10 +23,10 @@ from .. import compat, compat_animation
 from ..access import library_of, settings_of
 from ..scene import scene_setup
 
+# Custom property of a scene during a bake: JSON, one [owner, name, value before, value of the bake] per change.
 _NOTED = "splannequin_bake_settings"
-"""Custom property of a scene during a bake: JSON, one [owner, name, value before, value of the bake] per change."""
+# Names of displays with sRGB values: Blender's, and those of ACES configurations.
 _SRGB = ("sRGB", "sRGB - Display", "sRGB Monitor", "sRGB Display")
-"""Names of displays with sRGB values: Blender's, and those of ACES configurations."""
 _OUT = "render.image_settings"
 _COLOURS = "Files are written for an sRGB display without a look, so that the plate keeps its colours."
 
@@ -202,8 +202,9 @@ def _has(scene: bpy.types.Scene, row: Setting) -> bool:
 
 
 def _has_strips(scene: bpy.types.Scene) -> bool:
-    """True if the scene's sequencer has strips. Strips outside the frame range also replace the rendered image."""
+    """True if the scene's sequencer has strips."""
     editor: Any = scene.sequence_editor
+    # Strips outside the frame range also replace the rendered image.
     return editor is not None and bool(len(editor.strips if hasattr(editor, "strips") else editor.sequences))
 
 
@@ -238,8 +239,8 @@ def _animated(scene: bpy.types.Scene) -> set[str]:
 
 active_bakes: dict[int, bool] = {}
 """`session_uid` of each scene being baked -> whether its file was saved since the last frame was written."""
+# `session_uid` of a scene -> the stored changes of its bake, while the file is being saved.
 _paused: dict[int, Any] = {}
-"""`session_uid` of a scene -> the stored changes of its bake, while the file is being saved."""
 
 
 def stale_scenes() -> Iterator[bpy.types.Scene]:
@@ -263,12 +264,11 @@ def _on_undo(*_: object) -> None:
 
 @persistent
 def _on_save(*_: object) -> None:
-    """Handler: restores the artist's settings before the file is saved. The frame being rendered may use some of
-    them."""
+    """Handler: restores the artist's settings before the file is saved."""
     _paused.clear()
     for scene in bpy.data.scenes:
         if scene.session_uid in active_bakes and _NOTED in scene:
-            active_bakes[scene.session_uid] = True
+            active_bakes[scene.session_uid] = True  # the frame being rendered may use the artist's settings
             _paused[scene.session_uid] = scene[_NOTED]
             restore(scene)
 

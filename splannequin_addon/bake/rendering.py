@@ -26,18 +26,15 @@ from . import render_settings
 
 COMPOSITED = "composited"
 """Name of the images' folder inside the output folder of a bake."""
+# Name prefix of the temporary folder for one part of a bake.
 _PART_PREFIX = ".part-"
-"""Name prefix of the temporary folder for one part of a bake."""
+# Seconds between two thread switches of Python while Blender renders. One global variable of Blender stores whether
+# Python may write to data. A render that begins while a panel is drawn restores the panel's "no" when it ends. Then
+# Python can write nothing until Blender is restarted. Measured in 4.3.2 with 8 renders each: at Python's default of 5
+# ms, the fault appeared after the second render. At 2 s it never appeared, because a draw is then not interrupted.
 _UNINTERRUPTED = 2.0
-"""Seconds between two thread switches of Python while Blender renders.
-
-One global variable of Blender stores whether Python may write to data. A render that begins while a panel is drawn
-restores the panel's "no" when it ends. Then Python can write nothing until Blender is restarted. Measured in 4.3.2 with
-8 renders each: at Python's default of 5 ms, the fault appeared after the second render. At 2 s it never appeared,
-because a draw is then not interrupted.
-"""
+# Switch interval before the first of the running renders changed it.
 _usual_interval = [sys.getswitchinterval()]
-"""Switch interval before the first of the running renders changed it."""
 _DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (Blender's defaults for new files)
 
 
@@ -224,6 +221,7 @@ class Run:
         """Moves a complete file to its final name. Raises JobError if it is incomplete, or OSError."""
         if not contract.is_whole_picture(path):
             raise self._write_error(f"Blender wrote {what} only partially to {place.parent}.", path)
+        # Otherwise a power cut after the rename could leave an empty file under the final name.
         with open(path, "rb+") as file:
             os.fsync(file.fileno())
         contract.make_folder(place.parent)

@@ -58,15 +58,16 @@ def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:
 def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """((width, height), overscan (left and right, above and below)) of an EXR, in pixels.
 
-    Reads the header, because Blender reports 0 x 0 for a multilayer file. Raises ValueError without a header, or if the
-    margins of opposite sides differ: Blender centres the pixels regardless of the frame's position.
+    Raises ValueError without a header, or if the margins of opposite sides differ.
     """
     header = _exr_header(path)
+    # From the header, because Blender reports 0 x 0 for a multilayer file.
     frame, data = (_exr_value(header, name, "box2i", "<4i") for name in ("displayWindow", "dataWindow"))
     if frame is None or data is None:
         raise contract.UserError(f"{path} is not an OpenEXR file. Freeze the take again.")
     (left, top, right, bottom), (data_left, data_top, data_right, data_bottom) = frame, data
     margin = (left - data_left, top - data_top)
+    # Blender centres the pixels, regardless of the frame's position in them.
     if margin != (data_right - right, data_bottom - bottom) or min(margin) < 0:
         raise contract.UserError(f"{path} has different overscan on opposite sides. Freeze the take again.")
     return (right - left + 1, bottom - top + 1), margin

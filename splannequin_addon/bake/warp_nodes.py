@@ -1,8 +1,7 @@
 """Nodes that freeze a plate by a take's warp: matte * plate(ST) + fill (`torch_backend/freeze/composite/warp.py`).
 
-Blender's smooth filters differ between versions, and none reproduces an unmoved pixel exactly. These nodes instead look
-up the four nearest pixels unfiltered and blend them bilinearly, in steps of 1/256 of a pixel. A position at a pixel's
-centre gives exactly that pixel.
+The nodes look up the four nearest pixels unfiltered and blend them bilinearly, in steps of 1/256 of a pixel. A position
+at a pixel's centre gives exactly that pixel.
 """
 
 from __future__ import annotations
@@ -47,6 +46,7 @@ def looked_up(
     """Socket of a plate of `size` sampled bilinearly through an ST map, at the map's size."""
     plate = compat.sized(tree, plate, size)
     s, t = compat.new_coordinates(tree, st)
+    # Blender's smooth filters differ between versions, and none reproduces an unmoved pixel exactly.
     (left, right, across), (low, high, up) = (_between(tree, v, n) for v, n in zip((s, t), size, strict=True))
     below, above = (
         _mixed(tree, across, compat.new_look_up(tree, plate, left, y), compat.new_look_up(tree, plate, right, y))

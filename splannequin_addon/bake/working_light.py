@@ -1,7 +1,7 @@
 """Nodes that decode working frames with a highlight shoulder. Blender reads these frames as sRGB.
 
 Below the knee the values are sRGB. Above it they encode light up to 64 times white, see
-`torch_backend/contract/colour.py`. Blender's curve nodes would end at 1.
+`torch_backend/contract/colour.py`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from ..access import set_value
 if TYPE_CHECKING:
     import bpy
 
+# Light level at which the shoulder begins.
 _KNEE = ((contract.SHOULDER_FROM + 0.055) / 1.055) ** 2.4
-"""Light level at which the shoulder begins."""
 _WIDE = 180.0
 
 
@@ -46,6 +46,7 @@ def lit(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket) -> bpy.types.No
 def _inverse_shoulder(tree: bpy.types.NodeTree, channel: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """Decoded light of a channel that was read as sRGB: max(c, knee) through the curve, less the knee, plus min(c,
     knee)."""
+    # By Math nodes, because Blender's curve nodes would end at 1.
     start, roll = contract.SHOULDER_FROM, contract.SHOULDER_ROLL
     srgb = _on(tree, _on(tree, channel, "MAXIMUM", _KNEE), "POWER", 1.0 / 2.4)
     grown = _on(tree, _on(tree, srgb, "MULTIPLY_ADD", 1.055 / roll, -(0.055 + start) / roll), "EXPONENT")

@@ -24,8 +24,8 @@ def unit(vectors: Floats) -> NDArray[np.float64]:
 
 
 def middle(values: Floats) -> NDArray[np.float64]:
-    """The median along the first axis. Replaces numpy's median, whose first call takes 20 ms to set up masked
-    arrays."""
+    """The median along the first axis."""
+    # Not `np.median`, whose first call takes 20 ms to set up masked arrays.
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=0)
     return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
 
@@ -63,7 +63,7 @@ def level(places: Floats, centres: Floats, ups: Floats) -> NDArray[np.float64]:
         raise JobError("The three points lie on one line.", "Choose three points that span the floor.", ExitCode.USAGE)
     normal = unit(normal)
     above = float(((centres - places[0]) @ normal).mean())
-    if abs(above) < 1e-3 * longest:
+    if abs(above) < 1e-3 * longest:  # the positions lie in the plane of the points
         above = float((np.asarray(ups, dtype=np.float64) @ normal).mean())
     rotation = turn(normal if above >= 0 else -normal, np.array([0.0, 0.0, 1.0]))
     middle = places.mean(axis=0)

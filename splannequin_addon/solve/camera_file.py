@@ -1,7 +1,6 @@
 """Cameras of Alembic, FBX and USD files, read by Blender's importers in a separate Blender process.
 
-A file may be gigabytes large, and an importer may crash on a damaged file. The separate process protects the artist's
-Blender from both, and from leftover data. It starts with factory settings, and scripts in files do not run.
+The process starts with factory settings, and scripts in files do not run.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ MOST_FRAMES = 100_000
 """Maximum number of frames read from a file."""
 LONGEST_SECONDS = 1800.0
 """Time limit for reading a file."""
+# Relative difference between the aspects of film back and frames above which a note is written.
 _FILM_SLACK = 0.02
-"""Relative difference between the aspects of film back and frames above which a note is written."""
+# Kinds of data that the USD importer skips.
 _NO_GEOMETRY = (
     "curves", "lights", "materials", "meshes", "volumes", "shapes", "skeletons", "blendshapes", "points",
 )  # fmt: skip
-"""Kinds of data that the USD importer skips."""
 
 
 def is_one(path: str) -> bool:
@@ -64,6 +63,8 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
         "fps": fps,
         "aspect": (render.pixel_aspect_x, render.pixel_aspect_y),
     }
+    # In a process of its own: a file may be gigabytes large, an importer may crash on a damaged file, and its data
+    # would be left over.
     script = str(Path(__file__).with_name("read_camera_file.py"))
     words = ["--", json.dumps(wanted)]
     if bpy.app.binary_path:
@@ -119,10 +120,10 @@ def main(words: str) -> int:
 
 
 def _new_file(size: tuple[int, int], fps: float, aspect: tuple[float, float]) -> bpy.types.Scene:
-    """The scene of an empty file with the clip's rate and size. Importers convert time by the rate, and the lens in
-    pixels depends on the size."""
+    """The scene of an empty file with the clip's rate and size."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.data.scenes[0]
+    # Importers convert time by the rate, and the lens in pixels depends on the size.
     scene.render.fps = max(1, round(fps))
     scene.render.fps_base = scene.render.fps / fps
     scene.render.resolution_x, scene.render.resolution_y = size
@@ -286,9 +287,10 @@ def _fbx() -> Callable[[str], Any] | None:
 
 
 def _correct_rate() -> None:
-    """Rescales all keyframes to the file's rate, because the Python importer treats a rate of 23.976 as 24."""
+    """Rescales all keyframes to the file's rate."""
     base = bpy.data.scenes[0].render.fps_base
     actions: Any = bpy.data.actions
+    # The Python importer treats a rate of 23.976 as 24.
     for curve in [curve for action in actions for curve in action.fcurves]:
         for key in curve.keyframe_points:
             for point in (key.co, key.handle_left, key.handle_right):

@@ -19,9 +19,8 @@ if TYPE_CHECKING:
 
 MOVING_CAMERA_HINT = "Choose a camera that moves like the clip's camera."
 """Hint for a camera that cannot be the clip's."""
+# Largest change in a still camera's matrix elements, relative to its position, because Blender's matrices are float32.
 _STILL = 1e-6
-"""Largest change in a still camera's matrix elements, relative to its position, because Blender's matrices are
-float32."""
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,12 @@ from ..scene.ownership import TAG
 from ..shot import inventory, scene_objects
 from . import alignment, guesses
 
+# Properties of camera data that get keyframes if the lens changes.
 _LENS = ("lens", "shift_x", "shift_y")
-"""Properties of camera data that get keyframes if the lens changes."""
+# Initial clip distances of a new camera: an empty range, which `_reach` extends.
 _NO_REACH = (1e6, 1e-6)
-"""Initial clip distances of a new camera: an empty range, which `_reach` extends."""
+# Type of our objects -> attribute of the shot's entry, see `scene_objects.PARTS`.
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
-"""Type of our objects -> attribute of the shot's entry, see `scene_objects.PARTS`."""
 
 
 def scene_from_solve(

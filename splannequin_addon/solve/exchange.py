@@ -26,8 +26,8 @@ from . import camera_file, camera_samples, scene_camera
 
 LEAST_TRACKED = 8
 """Minimum number of solved frames of a tracked camera."""
+# Time per timer step for sampling a camera of the scene.
 _READING_SECONDS = 0.02
-"""Time per timer step for sampling a camera of the scene."""
 
 
 def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> contract.SolveParams:
@@ -148,8 +148,8 @@ def _sampled(turns: Iterator[tuple[int, int]]) -> Iterator[job_timer.Progress]:
 
 
 def _said(value: float) -> float:
-    """A number as typed: Blender's float has 32 bits, so that 23.976 becomes 23.9759998."""
-    return float(f"{value:.7g}")
+    """A number as typed."""
+    return float(f"{value:.7g}")  # Blender's float has 32 bits: 23.976 becomes 23.9759998
 
 
 def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
@@ -190,10 +190,7 @@ def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
 
 
 def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:
-    """A clip's lens as fields of a nerfstudio transforms.json. Raises JobError for an unsupported distortion model.
-
-    Blender's polynomial model is the radial part of OpenCV's. Its pixel rows are counted from the bottom.
-    """
+    """A clip's lens as fields of a nerfstudio transforms.json. Raises JobError for an unsupported distortion model."""
     camera, (width, height) = present(present(clip.tracking).camera), size_of(clip)
     model = camera.distortion_model
     bend = {
@@ -212,8 +209,8 @@ def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:
     centre: Any = camera.principal_point_pixels
     focal, (x, y) = float(camera.focal_length_pixels), centre
     lens = {"w": int(width), "h": int(height), "fl_x": focal, "fl_y": focal * float(camera.pixel_aspect)}
-    lens |= {"cx": float(x), "cy": float(height - y), "camera_model": "OPENCV"}
-    return {**lens, **(values if model == "POLYNOMIAL" else {})}
+    lens |= {"cx": float(x), "cy": float(height - y), "camera_model": "OPENCV"}  # Blender counts rows from the bottom
+    return {**lens, **(values if model == "POLYNOMIAL" else {})}  # the radial part of OpenCV's
 
 
 # ------------------------------------------------------------------------------------------------- out

@@ -1,7 +1,6 @@
 """Marks frames whose camera the solve did not find: with coloured keyframes, and with a timeline marker per range.
 
-Timeline markers have no custom properties, so the shot's entry stores the name and frame of ours. A marker that the
-artist renamed or moved no longer counts as ours.
+A marker that the artist renamed or moved no longer counts as ours.
 """
 
 from __future__ import annotations
@@ -57,6 +56,7 @@ def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) ->
         name = f"no solve {first}-{last}" if last > first else f"no solve {first}"
         name += f" ({entry.name})" if neighbours else ""
         put.append([scene.timeline_markers.new(name, frame=first).name, first])
+    # Timeline markers have no custom properties that could hold a tag.
     entry.marks = json.dumps(put) if put else ""
 
 

@@ -1,8 +1,7 @@
 """The motion matte in Blender: the solve's result, shown in the Image Editor, with the artist's paint.
 
 Black is still, white moves, grey is unknown. Saved paint is in the shot, SHOT/motion_paint/NNNNNN.png, and takes
-precedence over the results of this and later solves. Unsaved paint is kept in the .blend: the image is packed, because
-Blender does not save the pixels of a generated image.
+precedence over the results of this and later solves. Unsaved paint is kept in the .blend, in packed images.
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from ..scene.ownership import MATTE_SHOT, TAG
 from ..shot import inventory, scene_objects
 from . import motion_overlay
 
+# Property of a painted image: frame number. `MATTE_SHOT` is the property for its shot.
 _FRAME = "splannequin_matte"
-"""Property of a painted image: frame number. `MATTE_SHOT` is the property for its shot."""
+# Property of a painted image: digest of the frame's image, to detect that another clip was imported since.
 _PICTURE = "splannequin_picture"
-"""Property of a painted image: digest of the frame's image, to detect that another clip was imported since."""
 MOVING_TINT = (255, 64, 0)
 """Tint of moving pixels, sRGB."""
 UNKNOWN_TINT = (64, 128, 255)
 """Tint of unknown pixels, sRGB."""
+# Alpha of moving pixels, 0..255, so that the plate remains visible.
 _OPAQUE = 150
-"""Alpha of moving pixels, 0..255, so that the plate remains visible."""
+# Alpha of unknown pixels, 0..255.
 _FAINT = 70
-"""Alpha of unknown pixels, 0..255."""
 
 
 def found_file(shot: Path, frame: int) -> Path:
@@ -112,7 +111,7 @@ def _fill(image: bpy.types.Image, pixels: np.ndarray) -> None:
         image.generated_width, image.generated_height = width, height
     pixels_of(image).foreach_set(pixels.ravel())
     image.update()
-    image.pack()
+    image.pack()  # otherwise Blender does not save the pixels of a generated image
 
 
 def find_image(shot: Path, frame: int) -> bpy.types.Image | None:

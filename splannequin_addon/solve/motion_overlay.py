@@ -12,8 +12,8 @@ from ..shot import scene_objects
 
 OVERLAY = "motion overlay"
 """Tag value of its image."""
+# Property of its image: which of our background images were visible before it was added.
 _BEFORE = "splannequin_shown_before"
-"""Property of its image: which of our background images were visible before it was added."""
 
 
 def find(scene: bpy.types.Scene, shot: Path) -> bpy.types.CameraBackgroundImage | None:

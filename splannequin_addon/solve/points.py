@@ -17,11 +17,11 @@ from ..access import mesh_of, named, scene_in
 from ..process import children
 from ..shot import scene_objects, selection
 
+# Size of a point in pixels.
 _SIZE = 3.0
-"""Size of a point in pixels."""
 _handler: Any = None
+# (key of the mesh, shader, batch) of the points drawn last.
 _kept: tuple[Any, ...] = ()
-"""(key of the mesh, shader, batch) of the points drawn last."""
 
 
 def coloured(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -18,8 +18,8 @@ from . import camera_samples
 if TYPE_CHECKING:
     import bpy
 
+# Maximum relative difference of aspect ratios, to allow for rounding to whole pixels.
 _ASPECT_SLACK = 0.01
-"""Maximum relative difference of aspect ratios, to allow for rounding to whole pixels."""
 
 
 def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[tuple[int, int], None, Path]:
@@ -60,8 +60,9 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
 
 
 def _check_aspect_ratio(scene: bpy.types.Scene, size: tuple[int, int]) -> None:
-    """Raises JobError if the render's aspect ratio differs from the clip's, because the camera's view depends on it."""
+    """Raises JobError if the render's aspect ratio differs from the clip's."""
     width, height = scene_setup.render_size(scene)
+    # A camera's field of view depends on the render's aspect ratio.
     if abs((width / height) / (size[0] / size[1]) - 1.0) > _ASPECT_SLACK:
         raise contract.JobError(
             f"The scene renders {width} x {height} pixels, but the clip has a different aspect ratio, {size[0]} x "
