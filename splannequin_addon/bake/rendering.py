@@ -30,8 +30,8 @@ COMPOSITED = "composited"
 _PART_PREFIX = ".part-"
 # Seconds between two thread switches of Python while Blender renders. One global variable of Blender stores whether
 # Python may write to data. A render that begins while a panel is drawn restores the panel's "no" when it ends. Then
-# Python can write nothing until Blender is restarted. Measured in 4.3.2 with 8 renders each: at Python's default of 5
-# ms, the fault appeared after the second render. At 2 s it never appeared, because a draw is then not interrupted.
+# Python can write nothing until Blender is restarted. Measured in 4.3.2 with 8 renders each: at 5 ms, Python's
+# default, the fault appeared after the second render. At 2 s it never appeared: a draw is then not interrupted.
 _UNINTERRUPTED = 2.0
 # Switch interval before the first of the running renders changed it.
 _usual_interval = [sys.getswitchinterval()]

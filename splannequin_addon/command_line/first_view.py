@@ -19,10 +19,10 @@ from ..freeze import shown_frames
 from ..shot import inventory, scene_objects
 from ..solve import cameras
 
+# Rotation of the light: from above, behind and to one side of a camera that looks along y.
 _SUN = (math.radians(50.0), 0.0, math.radians(-40.0))
-"""Rotation of the light: from above, behind and to one side of a camera that looks along y."""
+# Strength of the light in W/m2: a white surface facing it renders as about white.
 _STRENGTH = 3.0
-"""Strength of the light in W/m2: a white surface facing it renders as about white."""
 
 
 def set_up(scene: bpy.types.Scene, shot: Path, name: str) -> None:

@@ -35,13 +35,13 @@ from ..solve import arrival, cameras, exchange, stmaps
 from . import first_view
 from .console import Console
 
+# Signals received by this command.
 _interrupts: list[int] = []
-"""Signals received by this command."""
 
 
 def _interrupt(number: int, frame: object) -> None:
-    """Records the signal, because Blender swallows exceptions raised in its handlers during a render."""
-    _interrupts.append(number)
+    """Records the signal."""
+    _interrupts.append(number)  # during a render, Blender swallows the exception
     raise KeyboardInterrupt
 
 
@@ -466,6 +466,7 @@ def _output(args: argparse.Namespace) -> Path:
     return output
 
 
+# Command -> its function.
 _COMMANDS = {
     "import": import_clip,
     "solve": solve,
@@ -482,9 +483,8 @@ _COMMANDS = {
     "status": status,
     "doctor": doctor,
 }
-"""Command -> its function."""
+# Field -> description of its default, used if the command line does not set it.
 _UNSET = {"device": "from the add-on's preferences"}
-"""Field -> description of its default, used if the command line does not set it."""
 
 
 def parser() -> argparse.ArgumentParser:

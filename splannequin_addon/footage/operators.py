@@ -18,8 +18,9 @@ from ..shot import selection, source
 from ..translations import tr
 from ..ui import icons, step_operator
 
+# Dropped images are left to Blender, because they are often references.
 VIDEO = ".mp4;.mov;.m4v;.mkv;.avi;.mxf;.mts;.webm;.mpg;.mpeg"
-"""Extensions of files that are accepted when dropped. Images are left to Blender, because they are often references."""
+"""Extensions of files that are accepted when dropped."""
 
 
 class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):

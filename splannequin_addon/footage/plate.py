@@ -14,8 +14,8 @@ from ..access import camera_of
 from ..scene import sequences
 from ..shot import scene_objects
 
+# Clip end of the camera, in scene units. It is so small that no object of the scene covers the plate.
 _REACH = 1e-2
-"""Clip end of the camera, in scene units. It is so small that no object of the scene covers the plate."""
 
 
 def show(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object | None:

@@ -81,11 +81,11 @@ class Import(Step):
 def _discard(job: jobs.Job) -> bool:
     """Removes the remains of a failed import, unless another job is running in the shot.
 
-    Returns True while the job's process is alive. Until it ends, it holds the shot's lock and, on Windows, its log
-    file, which cannot be deleted.
+    Returns True while the job's process is alive.
     """
     if any(watch.shot == job.shot and watch.running() for watch in job_timer.watches()):
         return False
+    # A living process holds the shot's lock and, on Windows, its log file, which cannot be deleted.
     if job.process is not None and job.process.poll() is None:
         return True
     contract.discard_unborn(job.shot)

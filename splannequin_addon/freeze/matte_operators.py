@@ -80,7 +80,8 @@ class SPLANNEQUIN_OT_remove_matte(step_operator.StepOperator, bpy.types.Operator
     name = StringProperty(name="Matte", description="Name of the matte to delete", options={"SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks for confirmation, because undo does not restore deleted files."""
+        """Asks for confirmation."""
+        # Undo does not restore deleted files.
         return context.window_manager.invoke_confirm(
             self, event, title="Delete this matte from disk?",
             message="It can be drawn again. This cannot be undone.", confirm_text="Remove", icon="WARNING",

@@ -14,13 +14,12 @@ from ..shot import scene_objects
 
 
 def show(scene: bpy.types.Scene, shot: Path, name: str, first: int, last: int) -> list[str]:
-    """Shows the previews of the take `name`, which have the frames' size and load faster than EXR files.
+    """Shows the previews of the take `name`, and hides the solve's points in all view layers.
 
-    Hides the solve's points in all view layers, because they would cover the image. Returns the changes as sentences;
-    empty without a solved camera.
+    Returns the changes as sentences; empty without a solved camera.
     """
     camera = scene_objects.part(scene, shot, "camera")
-    path = contract.TakeFolder(contract.ShotFolder(shot).takes / name).preview(first)
+    path = contract.TakeFolder(contract.ShotFolder(shot).takes / name).preview(first)  # faster than the EXR
     if camera is None or not path.is_file():
         return []
     data = camera_of(camera)
@@ -37,5 +36,5 @@ def show(scene: bpy.types.Scene, shot: Path, name: str, first: int, last: int) -
     points = scene_objects.part(scene, shot, "points")
     for layer in scene.view_layers:
         if points is not None and points.name in layer.objects:
-            points.hide_set(True, view_layer=layer)
+            points.hide_set(True, view_layer=layer)  # they would cover the image
     return [f"The camera shows the frames of take {name}. The points are hidden."]

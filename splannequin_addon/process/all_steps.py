@@ -37,13 +37,13 @@ class Chain:
 
 
 _chains: dict[Path, Chain] = {}
+# (paces of this machine, time when they were read in monotonic seconds).
 _paces: tuple[dict[str, float], float] = ({}, 0.0)
-"""(paces of this machine, time when they were read in monotonic seconds)."""
 
 
 def paces() -> dict[str, float]:
-    """`contract.paces` of the backend's environment. Read every few seconds, because panels ask at every redraw."""
-    global _paces
+    """`contract.paces` of the backend's environment, read every few seconds."""
+    global _paces  # cached, because panels ask at every redraw
     if not _paces[1] or time.monotonic() - _paces[1] > _READ_SECONDS:
         found: dict[str, float] = {}
         with contextlib.suppress(contract.JobError):

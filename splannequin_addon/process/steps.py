@@ -163,9 +163,8 @@ def add(step: Step) -> None:
 
 
 def step_of(job: jobs.Job) -> str:
-    """Name of the step that a job belongs to. Read from the job's folder, because Freeze and Bake use the same kind of
-    job."""
-    noted = _noted(job, contract.STEP_FILE)
+    """Name of the step that a job belongs to."""
+    noted = _noted(job, contract.STEP_FILE)  # Freeze and Bake start the same kind of job
     names = [s.name for s in STEPS.values() if job.kind in (s.kind, *s.also)]
     return noted if noted in names else names[0]
 

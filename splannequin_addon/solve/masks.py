@@ -15,8 +15,8 @@ from . import drawn_masks, exchange
 
 LABELS = {"ignore": "Ignore", "people": "People"}
 """Kind of mask -> its label on the panel."""
+# Choice on the panel -> the backend's keyword, for choices that are not files.
 _WORDS = {"NONE": "", "ALPHA": contract.MASK_ALPHA, "FOUND": contract.MASK_FOUND}
-"""Choice on the panel -> the backend's keyword, for choices that are not files."""
 
 
 def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolveParams:

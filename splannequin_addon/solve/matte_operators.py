@@ -155,7 +155,8 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks for confirmation, because undo does not restore deleted files."""
+        """Asks for confirmation."""
+        # Undo does not restore deleted files.
         return context.window_manager.invoke_confirm(
             self, event, title="Delete the painted matte of this frame from disk?",
             message="The matte from the solve is used again. This cannot be undone.", confirm_text="Remove",

@@ -1,7 +1,4 @@
-"""Small images on the panel: the training's preview, and its error over time.
-
-They are stored as previews, so that the artist's file contains no images of them.
-"""
+"""Small images on the panel: the training's preview, and its error over time."""
 
 from __future__ import annotations
 
@@ -69,8 +66,8 @@ def forget() -> None:
 
 
 def _make_room() -> None:
-    """Removes all images if there are too many. A long training would keep hundreds."""
-    if len(_collection) >= _KEPT:
+    """Removes all images if there are too many."""
+    if len(_collection) >= _KEPT:  # a long training would keep hundreds
         _collection.clear()
 
 
@@ -78,6 +75,7 @@ def register() -> None:
     """Creates the collection, except in background mode."""
     global _collection
     if not bpy.app.background:
+        # Previews, so that the artist's file contains no image data-blocks of them.
         _collection = bpy.utils.previews.new()
 
 

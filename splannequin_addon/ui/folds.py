@@ -1,8 +1,7 @@
 """Open steps of the panel: the step to work on, and those that the artist opened.
 
-Blender stores whether a registered panel is open, and no script can change it. A layout panel can instead use a
-property. The properties in this module store nothing: each is computed from the shot whenever the panel is drawn. A
-step that the artist opens or closes keeps that state until it equals the computed one.
+The properties in this module store nothing: each is computed from the shot whenever the panel is drawn. A step that the
+artist opens or closes keeps that state until it equals the computed one.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from ..process import job_timer, steps
 from ..properties import BoolProperty
 from ..shot import selection
 
+# (`session_uid` of the scene, shot folder, step) -> open state set by the artist.
 _chosen: dict[tuple[int, Path | None, str], bool] = {}
-"""(`session_uid` of the scene, shot folder, step) -> open state set by the artist."""
 
 
 def current_step(scene: bpy.types.Scene) -> str:
@@ -64,6 +63,8 @@ def _property(step: str) -> bool:
     )
 
 
+# Blender stores whether a registered panel is open, and no script can change it. A layout panel can instead use a
+# property.
 class Folds:
     """Open state of each step, as properties `is_STEP_open` of a scene's settings."""
 

@@ -93,8 +93,8 @@ def draw(layout: bpy.types.UILayout, kind: str, state: ShotState, chosen: str) -
 def remove(shot: Path, folder: Path, wait: bool) -> None:
     """Removes a folder of a shot. It disappears at once; a thread deletes its files, unless `wait` is set.
 
-    If the folder is a link, only the link is removed, because its target is not part of the shot. Raises OSError if the
-    folder cannot be moved: a file is open elsewhere (Windows) or protected, or the parent is a link.
+    If the folder is a link, only the link is removed. Raises OSError if the folder cannot be moved: a file is open
+    elsewhere (Windows) or protected, or the parent is a link.
     """
     if contract.is_link(folder.parent):
         raise OSError(
@@ -103,7 +103,7 @@ def remove(shot: Path, folder: Path, wait: bool) -> None:
     trash = contract.ShotFolder(shot).trash
     if contract.is_link(trash):
         contract.remove_link(trash)
-    if contract.is_link(folder):
+    if contract.is_link(folder):  # its target is not part of the shot
         contract.remove_link(folder)
         return
     trash.mkdir(exist_ok=True)

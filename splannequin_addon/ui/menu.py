@@ -1,4 +1,4 @@
-"""The menu Render > Splannequin. It contains all operators, because Blender's search (F3) only finds menu entries."""
+"""The menu Render > Splannequin, which contains all operators."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import bpy
 from ..access import layout_of
 from . import icons
 
+# Names of operators in order of use. Operators that are missing here come last.
 _GROUPS = (
     ("use_clip", "import_clip", "solve_camera", "load_camera", "train", "cancel"),
     ("t_star_here", "t_star_marker", "suggested_instant", "live", "freeze"),
@@ -19,9 +20,8 @@ _GROUPS = (
     ("set_up", "check_backend", "remove_backend"),
     ("locate_shot", "remove_shot"),
 )
-"""Names of operators in order of use. Operators that are missing here come last."""
+# Operators that are only in the menu of the editor they need.
 _EXCLUDED = {"use_movie_clip"}
-"""Operators that are only in the menu of the editor they need."""
 
 
 def searchable() -> set[str]:
@@ -37,6 +37,7 @@ def entries() -> Iterator[list[str]]:
     for group in _GROUPS:
         yield [name for name in group if name in left]
         left -= set(group)
+    # Operators without a group also belong in a menu, because Blender's search (F3) only finds menu entries.
     yield sorted(left)
 
 

@@ -27,12 +27,12 @@ class Pick(OperatorBase):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Disabled while a step of this shot runs, because the step uses the names in the settings."""
+        """Disabled while a step of this shot runs."""
         watch, state = known(context)
         if watch is None or state is None:
             cls.poll_message_set(tr("No shot is chosen: import a clip first"))
             return False
-        if watch.running():
+        if watch.running():  # the step uses the names in the settings
             cls.poll_message_set(tr("A step of this shot is running"))
             return False
         return True
@@ -46,7 +46,8 @@ class Remove(Pick):
     warning = ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks for confirmation, because undo does not restore deleted files."""
+        """Asks for confirmation."""
+        # Undo does not restore deleted files.
         return context.window_manager.invoke_confirm(
             self, event, title=self.question, message=self.warning, confirm_text="Remove", icon="WARNING"
         )

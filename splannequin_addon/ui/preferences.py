@@ -15,10 +15,10 @@ from ..properties import BoolProperty, EnumProperty, StringProperty
 from ..translations import tr
 from .sentences import wrap
 
+# Horizontal space in pixels that is not available to text: the page's margins and boxes.
 _INSET = 150
-"""Horizontal space in pixels that is not available to text: the page's margins and boxes."""
+# Width of the dialog in pixels.
 _DIALOG = 640
-"""Width of the dialog in pixels."""
 _setup: environment.SetUp | None = None
 _findings: list[str] = []
 
@@ -295,8 +295,8 @@ def _at_work(pid: int) -> str:
     )
 
 
+# Doctor questions without an answer.
 _checks: list[children.Question] = []
-"""Doctor questions without an answer."""
 
 
 def _show_findings(question: children.Question) -> None:

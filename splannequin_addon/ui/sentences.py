@@ -1,4 +1,4 @@
-"""Draws sentences with line breaks, and rows of tables. Blender truncates long labels."""
+"""Draws sentences with line breaks, and rows of tables."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ..translations import tr
 if TYPE_CHECKING:
     import bpy
 
+# Average width of a letter in pixels, at a user interface scale of 1.
 _LETTER = 6.2
-"""Average width of a letter in pixels, at a user interface scale of 1."""
 _UNIT = re.compile(r"(?<=\d) (?=(%|px|dB|fps|s|min|h|[KMG]B)(?!\w))")
 _BOUND = "\N{NO-BREAK SPACE}"
 
@@ -40,6 +40,7 @@ def wrap(
     room -= 25 if icon != "NONE" else 0
     column = layout.column(align=True)
     column.scale_y = 0.8
+    # A label has no line breaks of its own: Blender truncates a long one.
     for number, line in enumerate(lines(tr(text), max(int(room / _LETTER), 16))):
         column.label(text=line, translate=False, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 

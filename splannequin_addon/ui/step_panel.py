@@ -19,8 +19,8 @@ from ..translations import tr
 from . import icons
 from .sentences import wrap
 
+# Lines of a step's state that are always shown. The others are in a sub-panel, so that the tab fits a 1080p screen.
 _LINES = 2
-"""Lines of a step's state that are always shown. The others are in a sub-panel, so that the tab fits a 1080p screen."""
 
 
 class StepPanel:
