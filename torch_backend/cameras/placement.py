@@ -25,8 +25,9 @@ class Similarity:
 
     @staticmethod
     def of(placement: Placement) -> Similarity:
-        """The similarity from solve units to scene units, with its rotation made orthonormal to float64 precision."""
+        """The similarity from solve units to scene units, with an orthonormal rotation."""
         matrix = np.array(placement.scene_from_solve, np.float64).reshape(4, 4)
+        # Blender's matrices are float32: this makes the rotation orthonormal to float64 precision.
         left, _, right = np.linalg.svd(matrix[:3, :3])
         return Similarity(left @ right, placement.scale, matrix[:3, 3])
 

@@ -32,18 +32,18 @@ PER_WORKING, FIRST_FRAMES = 3.6, 3.5
 """Cost of a megapixel of working frames, at whose size masks and visibility are computed, in megapixels of frozen
 frames; extra cost of a take's first frame, which loads most plates, in frames. From "What a frame costs" in
 docs/benchmarks.md."""
+# Kind of job -> (fixed seconds, seconds per unit of work), for `sitting.mp4` on two cores of an EPYC.
 _SECONDS = {"import": (1.0, 0.18), "solve": (3.0, 1.7), "train": (3.0, 0.116), "freeze": (15.0, 0.28)}
-"""Kind of job -> (fixed seconds, seconds per unit of work), for `sitting.mp4` on two cores of an EPYC."""
 BEGINS_WITH = {"import": "import", "solve": "solve", "train": "training", "freeze": "developing"}
 """Kind of job -> its first stage. A job that reports the first percents of this stage started from nothing."""
 LASTING_STAGES = ("solve", "training", "freezing")
 """Stages that last until the end of a job, so that their estimate is also the job's."""
+# A job that exceeds its expected seconds is expected to take this share of its elapsed time in addition.
 _OVERDUE = 0.1
-"""A job that exceeds its expected seconds is expected to take this share of its elapsed time in addition."""
+# A job that takes less than this share of its expected seconds has reused earlier work: its pace is ignored.
 _BEGUN_BEFORE = 0.5
-"""A job that takes less than this share of its expected seconds has reused earlier work: its pace is ignored."""
+# Paces kept per kind; fewest expected seconds of a job whose pace counts; range of plausible paces.
 _KEPT, _LEAST_SECONDS, _FACTORS = 8, 5.0, (0.01, 100.0)
-"""Paces kept per kind; fewest expected seconds of a job whose pace counts; range of plausible paces."""
 
 
 @dataclass(frozen=True)
@@ -167,8 +167,6 @@ class TotalProgress:
     def at(self, kind: str, spent: float, left: float | None) -> tuple[float, float]:
         """(finished share, which never decreases; seconds left) of all jobs while one of them runs.
 
-        Later jobs are expected to run at the pace of the jobs so far, which takes a busy machine into account.
-
         Args:
             kind: kind of the running job.
             spent: seconds since this job began.
@@ -186,6 +184,7 @@ class TotalProgress:
             remaining = max(mean - spent, _OVERDUE * max(mean, spent))
         if spent + remaining >= _BEGUN_BEFORE * expected_of_job:
             expected, actual = expected + expected_of_job, actual + spent + remaining
+        # Later jobs run at the pace of the jobs so far, which takes a busy machine into account.
         pace = actual / expected if expected > 0.0 else 1.0
         order = list(self._expected)
         follows = order[order.index(kind) + 1 :] if kind in self._expected else []

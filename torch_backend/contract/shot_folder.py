@@ -231,13 +231,14 @@ class ShotFolder:
         return self.takes / checked_name(name, "take")
 
     def own(self, folder: Path) -> Path:
-        """`folder` of this shot, checked before files in it are written or removed: a shot may come from anywhere.
+        """`folder` of this shot, checked before files in it are written or removed.
 
         JobError if `folder` is not a folder. JobError if it, or one of its parents in the shot, is a link.
         """
         path = self.root
         for part in folder.relative_to(self.root).parts:
             path = path / part
+            # A shot may come from anywhere: a link in it must not lead writes to other files.
             if is_link(path):
                 raise JobError(
                     f"{path} is a link to {os.path.realpath(path)}. This shot must not change files there.",

@@ -42,11 +42,12 @@ class EarlierWork:
     def may_be_same(self, settings: Mapping[str, Any], info: SourceInfo) -> bool:
         """True if an import with these settings may yield the same pictures. Only decoding gives certainty.
 
-        `settings` and `info` use the shot's frame numbers. Two imports of the same pictures may have different keys,
-        for example if one names the full range, reads a repackaged file, or is by an earlier version.
+        `settings` and `info` use the shot's frame numbers.
         """
         if not self.record or info.last is None:
             return bool(self.record)
+        # Imports of the same pictures may have different keys, for example with the full range named, or a repackaged
+        # file.
         rows, before = self.record["frames"], dict(self.record.get("config") or {})
         first, last = settings["first"], settings["last"]
         first = info.first if first is None else max(info.first, first)

@@ -78,7 +78,8 @@ def refuse_cuts(measures: list[FrameMeasures], folder: Path, shift: int) -> None
 
 
 def _cut_error(numbers: list[int], found: list[Transition]) -> Exception:
-    """The error for a clip with cuts. It uses the footage's own `numbers`, because the user enters ranges in them."""
+    """The error for a clip with cuts, in the footage's own frame `numbers`."""
+    # The user enters ranges in the footage's own numbers.
     starts = [numbers[0], *(numbers[one.after] for one in found)]
     ends = [*(numbers[one.before] for one in found), numbers[-1]]
     longest = max(zip(starts, ends, strict=True), key=lambda take: take[1] - take[0])

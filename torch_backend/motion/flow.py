@@ -180,11 +180,8 @@ class Matches:
 def dense_flow(
     dis: cv2.DISOpticalFlow, one: NDArray[np.uint8], two: NDArray[Any], start: NDArray[Any] | None = None
 ) -> Map:
-    """Flow [H, W, 2] from each pixel of `one` to its position in `two`, searched around `start` if there is one.
-
-    The cast is needed because OpenCV's stubs require a start.
-    """
-    return cast(Any, dis).calc(one, two, start)
+    """Flow [H, W, 2] from each pixel of `one` to its position in `two`, searched around `start` if there is one."""
+    return cast(Any, dis).calc(one, two, start)  # OpenCV's stubs require a start
 
 
 def sample(values: NDArray[Any], at: tuple[Map, Map]) -> Map:

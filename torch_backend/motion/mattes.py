@@ -89,12 +89,10 @@ def is_outdated(shot: Shot) -> bool:
 
 
 def motion_key(shot: Shot, with_found: bool = True) -> str:
-    """Key that changes with every painted matte and, if `with_found`, with the detected mattes.
-
-    The key uses the contents of painted mattes, so that a training run can resume in a copied shot.
-    """
+    """Key that changes with every painted matte and, if `with_found`, with the detected mattes."""
     found = record_of(shot.motion / _RECORD).get("key") if with_found and is_found(shot) else None
     painted = sorted(p for p in shot.painted.glob("*.png") if p.is_file())
+    # By content instead of time, so that a training run can resume in a copied shot.
     return content_key(found, [[p.name, _content(p)] for p in painted])
 
 

@@ -90,14 +90,14 @@ def write_surface(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) 
 
 
 def read_surface(folder: Path) -> SurfacePoints:
-    """All points in a folder of mattes. Damaged files are skipped, because training does not depend on the points."""
+    """All points in a folder of mattes. Damaged files are skipped."""
     parts: list[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]] = []
     for path in sorted(folder.glob("*" + SURFACE)):
         frame = frame_number(path.stem)
         if frame is None:
             continue
         arrays = _arrays(path)
-        if arrays is not None:
+        if arrays is not None:  # training does not depend on the points
             parts.append((*arrays, np.full(len(arrays[0]), frame, np.int64)))
     if not parts:
         return NO_SURFACE

@@ -96,11 +96,11 @@ def _body(backend: str, means: Tensor) -> str:
 
 
 def _run(body: str, scene: Scene) -> RasterOutput:
-    """Run a body on a scene. Warp is imported only when needed, because the import is slow."""
+    """Run a body on a scene."""
     if body == "reference":
         return reference.rasterize(scene)
     if body == "cuda":
-        from . import cuda
+        from . import cuda  # only when needed, because the import of Warp is slow
 
         return cuda.rasterize(scene)
     return cpu.rasterize(scene)

@@ -56,11 +56,9 @@ def extract(
 
 
 def start_params(request: Request) -> str:
-    """Initial lens as COLMAP's comma-separated parameters; empty if COLMAP guesses it.
-
-    With an initial lens COLMAP verifies pairs through that lens, which a fisheye needs: its epipolar lines are curves.
-    """
+    """Initial lens as COLMAP's comma-separated parameters; empty if COLMAP guesses it."""
     focal, (width, height) = request.start_focal, request.size
+    # With an initial lens, COLMAP verifies pairs through it. A fisheye needs that: its epipolar lines are curves.
     if not focal and request.camera_model == FISHEYE:
         focal = FISHEYE_START * width
     if not focal:

@@ -1,7 +1,6 @@
 """Retries a solve that is refused or poor: one strategy after the other, each announced before it runs.
 
-Each attempt is a request to the worker in its own folder. COLMAP's database moves from one attempt to the next, so that
-features are extracted twice at most.
+Each attempt is a request to the worker in its own folder. COLMAP's database moves from one attempt to the next.
 """
 
 from __future__ import annotations
@@ -184,6 +183,7 @@ def _attempt(
     """Runs one attempt, which takes over COLMAP's database from the attempt `before`."""
     folder = scratch / strategy
     make_folder(folder)
+    # With the earlier database, features are extracted twice at most, and earlier pairs are not matched again.
     reuse = before is not None and (before.folder / DATABASE_FILE).is_file()
     if before is not None and reuse:
         replace_file(before.folder / DATABASE_FILE, folder / DATABASE_FILE)

@@ -33,10 +33,8 @@ _BARE_HINT = "Choose a sharper range, or film with more light and texture in vie
 
 
 def doubt_of(moving: float) -> tuple[str, str] | None:
-    """(message, hint) if the share `moving` of independently moving pixels is too large; else None.
-
-    Without parallax, wrong cameras fit their matches. The only sign of the error is that the whole scene seems to move.
-    """
+    """(message, hint) if the share `moving` of independently moving pixels is too large; else None."""
+    # Without parallax, wrong cameras fit their matches. The only sign is that the whole scene seems to move.
     if moving < MUCH_MOVES:
         return None
     return (
