@@ -201,6 +201,7 @@ def write_map(path: Path, pixels: NDArray[np.float32], key: str = "") -> Path:
             if output is None:
                 raise OSError(errno.EIO, f"OpenImageIO cannot write EXR: {oiio.geterror()}", str(path))
             if not (open_output(output, partial, spec) and output.write_image(pixels) and output.close()):
+                output.close()  # Windows cannot remove the partial file while it is open
                 need_disk(path.parent, pixels.nbytes, "the map")
                 raise OSError(errno.EIO, f"map not written: {output.geterror()}", str(path))
     except OSError as error:

@@ -168,7 +168,7 @@ def doubts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     """(sentence, hint) for imported cameras that are used although they fit the frames badly."""
     if answer.get("agreement", 1.0) >= POOR_AGREEMENT:
         return []
-    share = f"{100 * answer['agreement']:.0f} %"
+    share = f"{100 * answer['agreement']:.0f}"
     return [
         (
             f"Only {share} % of the matches between frames agree with the imported cameras.",
