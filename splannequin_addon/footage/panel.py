@@ -23,13 +23,16 @@ class ImportPanel(step_panel.StepPanel):
         """Clip, range, first frame number."""
         props = settings_of(scene_in(context))
         layout.prop(props, "clip", text="")
-        row = layout.row(heading="Range")
+        column = layout.column()
+        column.use_property_split = True  # aligns the two checkboxes behind their headings
+        column.use_property_decorate = False
+        row = column.row(align=True, heading="Range")
         row.prop(props, "use_range", text="")
         span = row.row(align=True)
         span.enabled = props.use_range
         span.prop(props, "first", text="")
         span.prop(props, "last", text="")
-        row = layout.row(heading="Start")
+        row = column.row(align=True, heading="Start")
         row.prop(props, "use_start", text="")
         start = row.row()
         start.enabled = props.use_start

@@ -1,5 +1,4 @@
-"""The backend's jobs from Blender's point of view: starts a detached child, reads its files, cancels it, finds it
-again.
+"""The backend's jobs, seen from Blender: starts a detached child, reads its files, cancels it, finds it again.
 
 No bpy. The job folder holds all state, so that every Blender that opens the shot sees the same.
 """
@@ -22,8 +21,7 @@ from typing import Any
 from ...torch_backend import contract
 from . import children
 
-# Maximum time to wait for a job's process after its last status.
-_EXIT_SECONDS = 10.0
+_EXIT_SECONDS = 10.0  # maximum time to wait for a job's process after its last status
 # Age after which a job without a status counts as never started.
 _START_SECONDS = 30.0
 _LOG_LINES = 6
@@ -31,8 +29,7 @@ _LOG_LINES = 6
 _FIRST_LOOK_SECONDS = 1.0
 # Time after a cancel request from which a second request kills the job.
 _KILL_SECONDS = 20.0
-# Longer time estimates are not shown.
-_LONGEST_SECONDS = 1e7
+_LONGEST_SECONDS = 1e7  # longer time estimates are not shown
 # Maximum bytes read of a request. A request with a t* for each of 100,000 frames has a fifth of this size.
 _LONGEST_REQUEST = 1 << 24
 # Seconds without a heartbeat after which a job of an older backend counts as dead.

@@ -30,8 +30,10 @@ class TrainPanel(step_panel.StepPanel):
         """The preset, and what the button will do to an existing run."""
         props = settings_of(scene_in(context))
         watch, plan = self._watch(context), self._plan(context)
-        self._presets(context, layout, watch.state if watch is not None else None)
-        if watch is None or watch.running() is not None:
+        running = watch.running() if watch is not None else None
+        if running != self.step:  # a running training needs the room for its progress
+            self._presets(context, layout, watch.state if watch is not None else None)
+        if watch is None or running is not None:
             return
         if plan.kind == "extend":
             layout.prop(props, "extend_steps")

@@ -2,9 +2,8 @@
 
 A small network of position and time moves the nodes. A Gaussian follows its 3 nearest nodes, in a space of position and
 learnt hyper-coordinates; each node rotates it about the node. Changes to the published code: nodes are sampled from the
-moving Gaussians, so no separate stage is needed and the host works with the gate. Scales change in the log. One
-rotation per node is used for both the positions and the orientations of its Gaussians. Positions of nodes and Gaussians
-are detached everywhere, as published.
+moving Gaussians, so no separate stage is needed and the host works with the gate. Scales change in the log. A node has
+one rotation, for positions and orientations of its Gaussians. Positions are detached everywhere, as published.
 
 `reference` is the published host with these exceptions. Nodes are not densified and pruned at 10,000 steps of stage
 two: the trainer does not pass on the screen gradients for it, its threshold is for the published rates of the
@@ -31,17 +30,7 @@ from .geometry import farthest_points, near_identity, nearest
 from .geometry import warm_up as warm_up_nearest
 from .mlp import Trunk, blurred, linear
 from .node_energies import acceleration_energy, arap_energy, elastic_energy
-from .protocol import (
-    Deformation,
-    Deltas,
-    HostConfig,
-    HostSpec,
-    Owned,
-    Rehearsal,
-    Start,
-    add_to_scale,
-    turn,
-)
+from .protocol import Deformation, Deltas, HostConfig, HostSpec, Owned, Rehearsal, Start, add_to_scale, turn
 
 PUBLISHED_ITERATIONS = 80_000
 _FOLLOWED = 3
@@ -50,8 +39,8 @@ _WINDOW = 0.05
 """ARAP: largest distance of the two times, in normalised time."""
 _SURROGATES = 16
 """Pre-training: maximum number of surrogate points per node."""
-# Pre-training: opacity below which surrogates are pruned.
 _PRUNED = 0.005
+"""Pre-training: opacity below which surrogates are pruned."""
 _INSTANTS = 16
 """Number of times at which a trajectory is sampled."""
 
