@@ -127,7 +127,7 @@ class Judge:
         """A frozen scene rendered from a frame's camera."""
         t, at = self.trainer, float(self.scene.times[index])
         view = t.viewmats[index], self.Ks[index]
-        return render_frozen(frozen, *view, self.width, self.height, t.model.exposure, at)
+        return render_frozen(frozen, *view, self.width, self.height, t.model.exposure, at).cpu()
 
     def frozen(self, frozen: FrozenGaussians, t_star: int) -> list[dict[str, Any]]:
         """`OF_FROZEN` at the instant of frame index `t_star`, one row per held-out frame that is far enough away."""

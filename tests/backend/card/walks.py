@@ -191,6 +191,46 @@ def station(folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def composited(folder: Path) -> dict[str, Any]:
+    """A frozen frame of plates on the card and on the processor: errors, and synchronisations on the card."""
+    import torch
+
+    from torch_backend.contract import TrainParams
+    from torch_backend.footage.plates import Plates
+    from torch_backend.freeze.composite.compositor import Compositor
+    from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen
+    from torch_backend.scene import load_scene
+    from torch_backend.train import load_run, train_shot
+
+    world, quiet = small_world(folder)
+    train_shot(world.shot, TrainParams(run="g", iterations=10, max_gaussians=260, device="cpu", holdout=0), quiet())
+    scene, plates = load_scene(world.shot), Plates(world.shot)
+    K, (t_star, frame) = scene.camera_at(plates.width, plates.height)[6], (scene.frames[1], scene.frames[6])
+    output = OutputFrame(frame, scene.viewmats[6], K, float(t_star), float(frame))
+
+    def made(device: str) -> Any:
+        run = load_run(world.shot, "g", torch.device(device))
+        frozen, exposure = freeze_at(run.model, scene.time_of_frame(t_star), 1.0), run.model.exposure
+        compositor, size = Compositor(run, scene, plates), (plates.width, plates.height)
+        for _ in range(2):  # the second frame finds all plates in the cache
+            image = render_frozen(frozen, output.viewmat, K, *size, exposure, scene.time_of_frame(frame))
+            CARD.waits.clear()
+            result = compositor.frame(output, frozen, image, *size, (frame,))
+            waits = dict(CARD.waits)
+        return result, waits
+
+    expected, _ = made("cpu")
+    with pretended_card():
+        found, waits = made("cuda")
+        devices = sorted({value.device.type for value in vars(found).values() if isinstance(value, torch.Tensor)})
+        found = found.cpu()
+    error = {
+        name: float((getattr(found, name) - getattr(expected, name)).abs().max())
+        for name in ("linear", "alpha", "plate", "support", "motion", "matte", "fill")
+    }
+    return {"devices": devices, "error": error, "waits": waits, "filled": float(expected.plate.mean())}
+
+
 def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
     """Bytes of a step per Gaussian, compared with the memory model. All Gaussians move, except with `static`."""
     import torch
@@ -300,7 +340,7 @@ def self_test(folder: Path) -> dict[str, Any]:
 
 WALKS = {
     "steps": steps, "recorded": recorded, "launches": launches, "resume": resume, "station": station,
-    "step_bytes": step_bytes, "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test,
+    "step_bytes": step_bytes, "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test, "composited": composited,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023,
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -48,7 +48,7 @@ _MIN_MATTE = 0.5 / 1024.0
 
 @dataclass
 class CompositeFrame:
-    """One frozen frame composited from plates, on the CPU, with the overscan of the render."""
+    """One frozen frame composited from plates, on the model's device, with the overscan of the render."""
 
     linear: Tensor
     """[H, W, 3] premultiplied, scene-linear: matte * plate(st) + fill."""
@@ -83,6 +83,11 @@ class CompositeFrame:
     """As in `FrozenImage`."""
     terms: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
     """Name -> [h, w] at decision resolution: evidence that chose the source of each pixel (`--debug-terms`)."""
+
+    def cpu(self) -> CompositeFrame:
+        """The frame on the CPU, for writing files; tensors that are there already are not copied."""
+        moved = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **moved, terms={name: term.cpu() for name, term in self.terms.items()})
 
     @property
     def color(self) -> Tensor:
@@ -158,8 +163,8 @@ class Compositor:
             return None
         (rows, columns), (height, width) = matte.shape, found.shape
         top, left = (rows - height) // 2, (columns - width) // 2
-        bars = torch.zeros(rows, columns, dtype=torch.bool, device="cpu")
-        bars[top : top + height, left : left + width] = from_numpy(found)
+        bars = torch.zeros_like(matte, dtype=torch.bool)
+        bars[top : top + height, left : left + width] = from_numpy(found).to(matte.device)
         matte[bars] = 1.0
         return bars
 
@@ -189,12 +194,12 @@ class Compositor:
         if len(parts) > 1:
             hand_back()
         has_primary = bool((matte > _MIN_MATTE).any())
-        plate = self.plates.linear(primary) if has_primary and not is_identity else None
+        plate = self.plates.linear(primary).to(matte.device) if has_primary and not is_identity else None
         composite = CompositeFrame(
-            torch.empty(rows, columns, 3, device="cpu"), image.alpha.clone(), image.color, image.alpha,
-            torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
+            torch.empty_like(image.color), image.alpha.clone(), image.color, image.alpha,
+            torch.empty_like(image.alpha), torch.empty_like(image.alpha), image.depth,
             torch.minimum(image.support, 1.0 - resized(target.out_of_view, columns, rows)),
-            resized(target.moved, columns, rows), primary, st, matte, torch.zeros(rows, columns, 3, device="cpu"),
+            resized(target.moved, columns, rows), primary, st, matte, torch.zeros_like(image.color),
             self.scene.display,
             terms={**primary_part.terms, **_terms(target, fillers)},
         )  # fmt: skip
@@ -203,7 +208,7 @@ class Compositor:
             matte[band] = (matte[band] * 1024.0).round() / 1024.0
             lead = sample(plate, st[band]) if plate is not None else None
             if has_primary and is_identity:
-                lead = self._placed(primary, rows, columns, band)
+                lead = self._placed(primary, rows, columns, band).to(matte.device)
             self._mix_rows(composite, filling, lead, band)
         return composite
 

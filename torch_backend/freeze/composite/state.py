@@ -105,7 +105,8 @@ def evidence(
 def log_odds(of: Evidence, config: StateConfig, unit: float) -> Tensor:
     """[h, w] log-odds that a plate shows another state than t*. `unit`: as `SourceViews.unit`."""
     weights = {f.name: float(getattr(config.weights, f.name)) for f in fields(StateWeights)}
-    total = sum((weights[name] * value for name, value in of.items()), torch.tensor(weights["bias"], device="cpu"))
+    bias = torch.full_like(of["change"], weights["bias"])
+    total = sum((weights[name] * value for name, value in of.items()), bias)
     return blurred(total, config.smoothing * unit)
 
 

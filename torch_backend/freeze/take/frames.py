@@ -116,10 +116,11 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
 def _composited(
     output: OutputFrame, frozen: FrozenGaussians, scene: Scene, spec: FrameSpec
 ) -> tuple[FrozenImage, FrozenImage | CompositeFrame]:  # fmt: skip
-    """(the splats' render, the frame) of one camera; both are the same without plate detail."""
+    """(the splats' render, the frame) of one camera, on the CPU; both are the same without plate detail."""
     exposed_at, K = scene.time_of_frame(output.exposed_like), whole_camera(output, spec)
     image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
-    return image, image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+    frame = image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+    return image.cpu(), frame.cpu()
 
 
 def _blur(
