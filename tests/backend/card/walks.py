@@ -340,7 +340,8 @@ def self_test(folder: Path) -> dict[str, Any]:
 
 WALKS = {
     "steps": steps, "recorded": recorded, "launches": launches, "resume": resume, "station": station,
-    "step_bytes": step_bytes, "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test, "composited": composited,
+    "step_bytes": step_bytes, "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test,
+    "composited": composited,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -240,6 +240,7 @@ class SourceViews:
     def _make_view(self, frame: int) -> PlateView:
         width, height = self.size
         frozen, image = self._render(frame, width, height)
+        viewmat, K = self.camera(frame, width, height)
         matte = self.moving(frame)
         moving = image.motion if matte is None else resized(matte.to(self.device), width, height)
         # The working frame is large enough, and faster to read than 4K footage.
@@ -253,7 +254,8 @@ class SourceViews:
         difference = blurred(dilate(difference, region), 0.5 * region)
         explained = torch.exp(-(difference / self.config.unexplained).square()).half().float()
         return PlateView(
-            *(part.to(self.device) for part in self.camera(frame, width, height)),
+            viewmat.to(self.device),
+            K.to(self.device),
             torch.stack([image.depth, dilate(moving, round(self.config.margin * self.unit)), explained], dim=-1),
             plate.half(),
             missed.half(),
