@@ -53,8 +53,8 @@ def _judged(
         labels = plate_labels(masks.labels(pair), where)
         for name, disabled in todo.items():
             composite, decided, _ = maker.make(pair.frame, disabled)
-            let_go = (composite.matte < LET_GO) | (composite.primary != pair.frame)
-            counts = count(let_go.numpy(), labels)
+            rejected = (composite.matte < LET_GO) | (composite.primary != pair.frame)
+            counts = count(rejected.numpy(), labels)
             ratios = {"iou": counts.iou, "extra_share": counts.extra_share}
             rows[name].append({"frame": pair.frame, "decision_s": decided, **ratios, **asdict(counts)})
     means = {name: {ratio: _mean(found, ratio) for ratio in ("iou", "extra_share")} for name, found in rows.items()}

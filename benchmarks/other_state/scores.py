@@ -129,8 +129,8 @@ def judged(clip: DetailClip, masks: Painted) -> Iterable[tuple[Row, View, Labels
         where = lenses[pair.frame].where(clip.width, clip.height) if lenses else straight
         labels = plate_labels(masks.labels(pair), where * scale)
         counts = {
-            name: count(let_go.numpy(), labels)
-            for name, let_go in zip(METHODS, _let_go(clip, pair.t_star, pair.frame, view), strict=True)
+            name: count(rejected.numpy(), labels)
+            for name, rejected in zip(METHODS, _let_go(clip, pair.t_star, pair.frame, view), strict=True)
         }
         yield Row(pair.t_star, pair.frame, counts), view, labels
 

@@ -14,9 +14,10 @@ from ..views.source_views import SourceViews
 from ..views.target_view import TargetView, displacements, parallax
 from ..views.visibility import Visibility
 from .config import CompositeConfig
+from .warp import MATTE_STEPS
 
-FULL_MATTE = 1.0 - 0.5 / 1024.0
-"""Matte above which rounding to 1024 steps gives 1, so that the pixel comes from the primary plate alone."""
+FULL_MATTE = 1.0 - 0.5 / MATTE_STEPS
+"""Matte above which rounding gives 1, so that the pixel comes from the primary plate alone."""
 _ROUGH = 1
 """Radius, in pixels at decision resolution, of the surroundings that a plate must also show to fill a pixel near a
 mover. Depth is rough near movers, so visibility changes from pixel to pixel, and single pixels would stand out."""

@@ -16,7 +16,7 @@ from ..views.reproject import pair, pixel_centres, project, resized, unproject
 from ..views.source_views import SourceViews
 from ..views.target_view import TargetView, parallax
 from .config import CompositeConfig
-from .state import Evidence, evidence, let_go, log_odds
+from .state import Evidence, evidence, log_odds, rejection
 from .warp import snap
 
 
@@ -70,10 +70,11 @@ def primary_matte(
     lead = source_views.seen(primary, target.points)
     is_clip_view = target.is_clip_view
     truth = source_views.seen(target.t, target.points) if target.t in usable else None
+    # Where plate t* does not show a point, model and own plate must agree that it moves.
     hidden = torch.minimum(target.motion, lead.moving) if is_clip_view else target.motion
     if truth is not None:
         target.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
-    else:
+    else:  # without plate t* nothing shows the movers of the instant, so that one of them is enough
         target.motion = torch.maximum(target.motion, lead.moving) if is_clip_view else target.motion
     target.moved = target.motion
     target.out_of_view = _out_of_view(
@@ -90,7 +91,7 @@ def primary_matte(
         return PrimaryMatte(within, st, is_clip_view)
     of = evidence(source_views, target, primary, lead, truth, config.state)
     odds = log_odds(of, config.state, source_views.unit)
-    target.doubt = let_go(odds, config.state)
+    target.doubt = rejection(odds, config.state)
     matte = 1.0 - target.doubt
     if is_clip_view:
         if free is not None:

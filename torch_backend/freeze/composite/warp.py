@@ -45,6 +45,8 @@ WARP_VERSION = 1
 """Version of the `splannequin:` attributes of a warp."""
 STEPS = 256
 """Number of coordinate steps per pixel."""
+MATTE_STEPS = 1024.0
+"""Number of steps of a matte from 0 to 1. Half floats store them exactly, so that matte and fill match in a file."""
 
 _FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) * 3 + (oiio.HALF,)
 _ROWS = 256

@@ -21,7 +21,7 @@ from torch_backend.footage.display import ROLLED
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze import freeze_shot
-from torch_backend.freeze.composite.state import StateConfig, let_go
+from torch_backend.freeze.composite.state import StateConfig, rejection
 from torch_backend.freeze.composite.warp import apply_warp, read_warp
 from torch_backend.freeze.exr import read_frozen_exr, read_key
 from torch_backend.motion.mattes import PAINTED, STILL, write_matte
@@ -67,7 +67,7 @@ def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
         terms = dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), 2, 0), strict=True))
         assert {"plate_matte", "change", "unseen", "agreed.105", "origin.develop"} <= terms.keys()
         matte = read_warp(take[0] / "warp" / f"{n:06d}.exr").matte
-        kept = 1.0 - let_go(torch.from_numpy(terms["log_odds"]), config)
+        kept = 1.0 - rejection(torch.from_numpy(terms["log_odds"]), config)
         assert kept.shape == matte.shape and float(kept.min()) < 0.1 < float(kept.max())
         np.testing.assert_allclose(np.asarray(matte), kept, atol=0.01)
         assert 0.02 < terms["origin.develop"].mean() <= 1.0
