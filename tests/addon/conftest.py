@@ -102,6 +102,13 @@ def shot(tmp_path: Path) -> Path:
     return make_shot.make_shot(tmp_path)
 
 
+@pytest.fixture
+def with_shot(scene, shot: Path):
+    """The scene with `shot` as its shot folder."""
+    scene.splannequin.shot_path = str(shot)
+    return scene
+
+
 @pytest.fixture(scope="session")
 def _frozen_world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     python = os.environ.get("SPLANNEQUIN_BACKEND_PYTHON")
