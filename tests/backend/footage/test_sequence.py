@@ -314,14 +314,6 @@ def test_pictures_of_two_sizes_are_refused(exrs):
         list(open_source(str(exrs)).frames(None, None))
 
 
-def test_a_folder_of_two_sequences_asks_which(exrs):
-    for i in range(3):
-        write(exrs / f"other.{i}.png", np.zeros((8, 8, 3), np.uint8))
-    with pytest.raises(JobError, match="contains 2 image sequences"):
-        open_source(str(exrs))
-    assert open_source(str(exrs / "other.1.png")).info.last == 2
-
-
 @pytest.mark.parametrize("name", ["", "single.png", "none.####.exr", "gone.png", "gone.mp4"])
 def test_what_is_no_sequence_is_refused(tmp_path, name):
     write(tmp_path / "single.png", np.zeros((8, 8, 3), np.uint8))

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import pytest
 import torch
 
+from tests.backend.trainings import take_steps
 from torch_backend.cli import Console
 from torch_backend.contract import Event, TrainParams
 from torch_backend.freeze.frozen import freeze_at, render_frozen
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
 from torch_backend.train.checkpoint import load_checkpoint
-from torch_backend.train.events import schedule_events
 from torch_backend.train.loop import train_to_end
 from torch_backend.train.model import restore_model
 from torch_backend.train.modelled import modelled
@@ -140,19 +140,13 @@ def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     assert len(probes) == 3
     runs[1].images[probes] = 1.0  # destroys these pictures
     for trainer in runs:
-        while trainer.iteration < 60:
-            schedule_events(trainer)
-            trainer.step()
-            trainer.iteration += 1
+        take_steps(trainer, 60)
     assert bool(runs[0].model.gaussians.open.any())
     for name, value in runs[0].model.gaussians.params.items():
         assert torch.equal(value, runs[1].model.gaussians.params[name]), name
     assert not runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
     for trainer in runs:
-        while trainer.iteration < 99:
-            schedule_events(trainer)
-            trainer.step()
-            trainer.iteration += 1
+        take_steps(trainer, 39)
     assert runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
     assert not torch.equal(runs[0].model.gaussians.params["sh0"], runs[1].model.gaussians.params["sh0"])
 
@@ -310,10 +304,7 @@ def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
     whole = finish(trainer_of(long_world, quiet, **changes), tmp_path)
     for stop in (45, 72):
         broken = trainer_of(long_world, quiet, **changes)
-        while broken.iteration < stop:
-            schedule_events(broken)
-            broken.step()
-            broken.iteration += 1
+        take_steps(broken, stop)
         save_run(broken, tmp_path / "broken.safetensors")
         resumed = trainer_of(long_world, quiet, **changes)
         restore_run(resumed, tmp_path / "broken.safetensors")

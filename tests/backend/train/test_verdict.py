@@ -2,12 +2,12 @@
 
 import dataclasses
 import re
-import sys
 
 import numpy as np
 import pytest
 import torch
 
+from tests.backend.conftest import build_world
 from torch_backend.contract import TrainParams, read_json, verdict_lines
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.train import train_shot
@@ -158,7 +158,7 @@ def test_run_reports_travel_distance(trained):
 
 @pytest.mark.parametrize("holdout", [8, 0])
 def test_person_walking_through_is_reported(tmp_path, quiet, holdout):
-    world = sys.modules[quiet.__module__].build_world(tmp_path)
+    world = build_world(tmp_path)
     params = TrainParams(iterations=200, max_gaussians=1500, holdout=holdout)
     walk_through(world.shot)
     report = quiet()

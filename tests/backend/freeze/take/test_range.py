@@ -141,16 +141,6 @@ def test_a_copied_shot_has_the_frames_that_it_had(trained, quiet, tmp_path):
     assert {p.name: p.stat().st_mtime_ns for p in instants.iterdir()} == developed
 
 
-def test_a_damaged_frame_is_rendered_again(trained, quiet):
-    world, _ = trained
-    folder = world.shot.take("broken")
-    ask = FreezeParams(take="broken", t_star=104, develop="off", first=101, last=102, only_missing=True)
-    freeze_shot(world.shot, ask, quiet())
-    (folder / "000102.exr").write_bytes(b"torn")
-    freeze_shot(world.shot, ask, quiet())
-    assert read_frozen_exr(folder / "000102.exr").metadata.frame == 102
-
-
 @pytest.mark.parametrize("grain", [True, False])
 def test_grain_layer_does_not_change_the_picture(trained, quiet, grain):
     world, _ = trained
