@@ -8,6 +8,7 @@ import shutil
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,9 +16,10 @@ import numpy as np
 import pytest
 import torch
 
+from tests.backend.pictures import write
 from tests.backend.solved_room import again, solved, tools  # noqa: F401 - fixtures
 from torch_backend.contract import CameraFrame, CameraPath
-from torch_backend.footage.images import write_png
+from torch_backend.footage.images import read_png, write_png
 from torch_backend.motion.mattes import MOVING, PAINTED, STILL, write_matte
 from torch_backend.raster import rasterize
 from torch_backend.shot import Shot, write_json
@@ -85,6 +87,31 @@ class World:
             background=torch.full((3,), 0.5),
         )
         return out.colors[0].clamp(0, 1)
+
+
+def film(world: World, folder: Path, picture: Callable[[int], np.ndarray], paint: bool = True, **config) -> Shot:
+    """A shot of pictures in FOLDER/source, of PNG or scene-linear EXR by their type, solved like the world and without
+    a lens. `paint`: everything is painted as static."""
+    from torch_backend.footage import FootageConfig, import_footage
+
+    (folder / "source").mkdir()
+    for n in range(FRAMES):
+        pixels = picture(n)
+        suffix = "png" if pixels.dtype == np.uint8 else "exr"
+        write(folder / "source" / f"a.{FIRST + n}.{suffix}", pixels)
+    shot = Shot.create(folder / "filmed.splannequin")
+    import_footage(shot, str(folder / "source"), FootageConfig(**config), Quiet())
+    shot.solve.mkdir()
+    for name in ("cameras.json", "points.npz"):
+        shutil.copyfile(world.shot.solve / name, shot.solve / name)
+    lens = {"camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
+    write_json(shot.solve_record, {"version": 1, "key": "k", **lens})
+    for n in range(FIRST, FIRST + FRAMES):
+        write_png(shot.plate(n), read_png(shot.raw / f"{n:06d}.png"))
+        if paint:
+            shot.painted_matte(n).parent.mkdir(exist_ok=True)
+            write_matte(shot.painted_matte(n), np.full((HEIGHT, WIDTH), STILL, np.uint8))
+    return shot
 
 
 def build_world(root: Path) -> World:

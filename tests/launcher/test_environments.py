@@ -257,6 +257,7 @@ def test_a_full_disk_is_said_before_anything_is_written(bare_environment: Enviro
 def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
     with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, index: str, needed: int
 ):
+    shutil.rmtree(with_torch.folder)
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", f"file://{tmp_path}{index}")
     disk = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 - 1e8)))
@@ -278,6 +279,7 @@ def test_an_index_out_of_reach_is_not_reckoned_with(
     with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
 ):
     """torch is then installed from the usual index, which on Linux has the build with CUDA."""
+    shutil.rmtree(with_torch.folder)
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "http://127.0.0.1:9/whl/cpu")
     disk = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(5e9)))

@@ -14,11 +14,11 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from tests.backend.conftest import film
 from torch_backend.contract import CameraPath, FreezeParams, TrainParams
-from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.color import InputSpace, linear_to_srgb
 from torch_backend.footage.display import ROLLED
-from torch_backend.footage.images import read_png, write_png
+from torch_backend.footage.images import read_png
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.composite.state import StateConfig, let_go
@@ -26,7 +26,6 @@ from torch_backend.freeze.composite.warp import apply_warp, read_warp
 from torch_backend.freeze.exr import read_frozen_exr, read_key
 from torch_backend.motion.mattes import PAINTED, STILL, write_matte
 from torch_backend.raster import rasterize
-from torch_backend.shot import Shot
 from torch_backend.train import train_shot
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -203,31 +202,17 @@ def test_a_ramp_that_runs_is_the_clip(trained, quiet):
 @pytest.fixture(scope="module")
 def bright(tmp_path_factory, world, quiet):
     """Static wall in half-float EXR at twice the size of the solve, with lamps of 50 and values below black."""
-    folder = tmp_path_factory.mktemp("bright")
-    (folder / "source").mkdir()
     rng = np.random.default_rng(4)
     lamps = [(int(y), int(x)) for y, x in rng.integers(4, 60, (12, 2))]
-    for n in range(16):
+
+    def picture_of(n):
         small = world.image(n, 0.0).numpy().astype(np.float32) ** 2.2
         picture = np.kron(small, np.ones((2, 2, 1), np.float32)) * rng.uniform(0.9, 1.1, (96, 128, 1))
         for k, (y, x) in enumerate(lamps):
             picture[y : y + 2, x : x + 2] = [50.0, 12.0, -0.02 * k]
-        spec = oiio.ImageSpec(128, 96, 3, "half")
-        out = oiio.ImageOutput.create(str(folder / "source" / f"a.{101 + n}.exr"))
-        assert out.open(str(folder / "source" / f"a.{101 + n}.exr"), spec)
-        assert out.write_image(picture.astype(np.float16)) and out.close()
-    shot = Shot.create(folder / "bright.splannequin")
-    import_footage(shot, str(folder / "source"), FootageConfig(working_height=48), quiet())
-    for name in ("cameras.json", "points.npz"):
-        shot.solve.mkdir(exist_ok=True)
-        (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
-    record = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
-    (shot.solve / "solve.json").write_text(json.dumps(record))
-    for n in range(101, 117):
-        write_png(shot.frames / f"{n:06d}.png", read_png(shot.frames / "raw" / f"{n:06d}.png"))
-        path = shot.root / PAINTED / f"{n:06d}.png"
-        path.parent.mkdir(exist_ok=True)
-        write_matte(path, np.full((48, 64), STILL, np.uint8))
+        return picture.astype(np.float16)
+
+    shot = film(world, tmp_path_factory.mktemp("bright"), picture_of, working_height=48)
     train_shot(shot, TrainParams(iterations=60, max_gaussians=900), quiet())
     return shot
 
@@ -277,29 +262,16 @@ LAMP = 20.0
 @pytest.fixture(scope="module")
 def lit(tmp_path_factory, world, quiet):
     """Trained shot of the wall in scene-linear EXR; its patch is a static lamp."""
-    folder = tmp_path_factory.mktemp("lit")
-    (folder / "source").mkdir()
-    state = world.at(0.0)
-    lamp = {name: value[world.moving] for name, value in state.items()}
-    for n in range(16):
+    lamp = {name: value[world.moving] for name, value in world.at(0.0).items()}
+
+    def picture_of(n):
         view = dict(viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
         covered = rasterize(**lamp, **view).alphas[0].numpy() > 0.5
         picture = (0.8 * world.image(n, 0.0).numpy()) ** 2.2
         picture[covered] = LAMP
-        path = str(folder / "source" / f"a.{101 + n}.exr")
-        out = oiio.ImageOutput.create(path)
-        assert out.open(path, oiio.ImageSpec(64, 48, 3, "half"))
-        assert out.write_image(picture.astype(np.float16)) and out.close()
-    shot = Shot.create(folder / "lit.splannequin")
-    import_footage(shot, str(folder / "source"), FootageConfig(), quiet())
-    shot.solve.mkdir(exist_ok=True)
-    for name in ("cameras.json", "points.npz"):
-        (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
-    for n in range(101, 117):
-        (shot.frames / f"{n:06d}.png").write_bytes((shot.raw / f"{n:06d}.png").read_bytes())
-        path = shot.root / PAINTED / f"{n:06d}.png"
-        path.parent.mkdir(exist_ok=True)
-        write_matte(path, np.full((48, 64), STILL, np.uint8))
+        return picture.astype(np.float16)
+
+    shot = film(world, tmp_path_factory.mktemp("lit"), picture_of)
     train_shot(shot, TrainParams(iterations=300, max_gaussians=1500, method="static"), quiet())
     return shot
 
