@@ -9,8 +9,9 @@ import shutil
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,6 +67,8 @@ class World:
     K: torch.Tensor
     state: dict[str, torch.Tensor]
     moving: torch.Tensor
+    summary: dict[str, Any] = field(default_factory=dict)
+    """Of the training, if it was trained."""
 
     def at(self, time: float) -> dict[str, torch.Tensor]:
         """The Gaussians at a time in [0, 1]: the patch sways by 0.2 units.
@@ -210,7 +213,7 @@ def world(tmp_path_factory) -> World:
 
 
 @pytest.fixture(scope="session")
-def trained(tmp_path_factory):
+def trained(tmp_path_factory) -> World:
     """The tiny shot with one finished run `main` (auto, support) and painted motion mattes.
 
     Tests may add takes, but must not change the run.
@@ -220,8 +223,8 @@ def trained(tmp_path_factory):
 
     world = build_world(tmp_path_factory.mktemp("trained"))
     paint_motion(world)
-    summary = train_shot(world.shot, TrainParams(iterations=900, holdout=8, max_gaussians=1500), Quiet())
-    return world, summary
+    params = TrainParams(iterations=900, holdout=8, max_gaussians=1500)
+    return replace(world, summary=train_shot(world.shot, params, Quiet()))
 
 
 @pytest.fixture(scope="module")
@@ -230,10 +233,9 @@ def trained_copy(trained, tmp_path_factory) -> World:
 
     Takes and instants of this copy do not affect other test files.
     """
-    world, _ = trained
-    root = tmp_path_factory.mktemp("copy") / world.shot.root.name
-    shutil.copytree(world.shot.root, root)
-    return replace(world, shot=Shot.open(root))
+    root = tmp_path_factory.mktemp("copy") / trained.shot.root.name
+    shutil.copytree(trained.shot.root, root)
+    return replace(trained, shot=Shot.open(root))
 
 
 @pytest.fixture(scope="session")

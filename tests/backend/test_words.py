@@ -24,10 +24,9 @@ LONG = "x" * 300
 @pytest.fixture(scope="module")
 def place(trained, tmp_path_factory):
     """Folder with a trained shot `s`, a plain file `file`, and broken camera paths."""
-    world, _ = trained
     folder = tmp_path_factory.mktemp("words")
     ignored = shutil.ignore_patterns("jobs", "takes")
-    shutil.copytree(world.shot.root, folder / "s", ignore=ignored)
+    shutil.copytree(trained.shot.root, folder / "s", ignore=ignored)
     (folder / "file").write_text("no folder")
     (folder / "deep.json").write_text("[" * 200_000)
     (folder / "list.json").write_text("[]")

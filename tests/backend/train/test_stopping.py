@@ -338,7 +338,7 @@ def test_time_nodes_follow_the_motion(long_world, quiet, tmp_path):
 
 
 def test_the_console_shows_the_table(trained):
-    _, summary = trained
+    summary = trained.summary
     rows = {row["what"]: row for row in summary["modelled"]}
     moving = rows["moving Gaussians"]
     assert moving["seconds"] + rows["static world"]["seconds"] == pytest.approx(summary["train_seconds"], abs=0.1)

@@ -25,19 +25,19 @@ from torch_backend.train.trainer import Trainer
 
 
 def test_it_learns_and_reports(trained):
-    world, summary = trained
+    summary = trained.summary
     assert summary["heldout_psnr_db"] > 24.0
     assert summary["heldout_frames"] == 1
-    rows = [json.loads(line) for line in (world.shot.run("main") / "metrics.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (trained.shot.run("main") / "metrics.jsonl").read_text().splitlines()]
     assert [r["iteration"] for r in rows] == list(range(90, 901, 90))
     assert rows[-1]["heldout_psnr_db"] > rows[0]["heldout_psnr_db"]
     assert all(r["moving_share"] == 0 for r in rows if r["iteration"] < 180)
 
 
 def test_the_gate_opens_for_the_patch_that_moves(trained):
-    world, summary = trained
-    run = load_run(world.shot, "main")
-    scene = load_scene(world.shot)
+    summary = trained.summary
+    run = load_run(trained.shot, "main")
+    scene = load_scene(trained.shot)
     rows = run.model.open_rows()
     assert 0.005 < summary["moving_share"] < 0.4
     means = run.model.gaussians.params["means"].detach()[rows] / scene.scale + torch.from_numpy(scene.centre).float()

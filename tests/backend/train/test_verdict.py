@@ -145,12 +145,12 @@ def walk_through(shot):
 
 def test_run_reports_travel_distance(trained):
     """The small world's patch sways by 0.4 units at depth 3.2, which is more than people who hold still."""
-    world, summary = trained
-    places = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
+    summary = trained.summary
+    places = [trained.at(time)["means"][trained.moving][0] for time in (0.25, 0.75)]
     true = float((places[0] - places[1])[0]) * 60.0 / 3.2
     assert summary["travel_px"] == pytest.approx(true, rel=0.35)
     assert (summary["quality"], summary["quality_on"]) == ("Fair", "held-out frames")
-    kept = read_json(world.shot.run("main") / "summary.json")
+    kept = read_json(trained.shot.run("main") / "summary.json")
     assert kept["verdict"] == summary["verdict"] and summary["unexplained_share"] < 0.01
     match = re.search(r"(\d+) of 64 pixels", verdict_lines(kept)[1])
     assert match and float(match[1]) == pytest.approx(summary["farthest_px"], abs=0.56), "rounded once, and once more"

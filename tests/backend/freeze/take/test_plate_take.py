@@ -48,16 +48,16 @@ def files(folder):
 
 @pytest.fixture(scope="module")
 def take(trained, quiet):
-    world, _ = trained
-    facts = freeze_shot(world.shot, FreezeParams(take="whole", **RANGE), quiet())
-    return world.shot.take("whole"), facts
+    facts = freeze_shot(trained.shot, FreezeParams(take="whole", **RANGE), quiet())
+    return trained.shot.take("whole"), facts
 
 
 def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
     """With `--debug-terms`, the frames are rendered again without change, and the log-odds reproduce the matte."""
-    world, _ = trained
     before = files(take[0])
-    freeze_shot(world.shot, FreezeParams(take="whole", only_missing=True, debug_terms=str(tmp_path), **RANGE), quiet())
+    freeze_shot(
+        trained.shot, FreezeParams(take="whole", only_missing=True, debug_terms=str(tmp_path), **RANGE), quiet()
+    )
     assert files(take[0]) == before
     assert sorted(path.stem for path in tmp_path.iterdir()) == [f"{n:06d}" for n in range(103, 109)]
     config = StateConfig()
@@ -73,9 +73,8 @@ def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
 
 
 def test_a_frame_is_its_warp_over_the_plate(trained, take):
-    world, _ = trained
     folder, facts = take
-    plates = Plates(world.shot)
+    plates = Plates(trained.shot)
     assert facts["warp_dir"] == str(folder / "warp")
     for n in range(103, 109):
         frame, warp = read_frozen_exr(folder / f"{n:06d}.exr"), read_warp(folder / "warp" / f"{n:06d}.exr")
@@ -91,27 +90,25 @@ def test_a_frame_is_its_warp_over_the_plate(trained, take):
 
 
 def test_without_detail_only_splats_are_rendered(trained, take, quiet):
-    world, _ = trained
     folder, _ = take
     whole = files(folder)
-    facts = freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, detail="off"), quiet())
-    bare = world.shot.take("bare")
+    facts = freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, detail="off"), quiet())
+    bare = trained.shot.take("bare")
     assert not (bare / "warp").exists() and "detail" not in facts and "warp_dir" not in facts
     for n in (103, 108):
         plain, detailed = read_frozen_exr(bare / f"{n:06d}.exr"), read_frozen_exr(folder / f"{n:06d}.exr")
         assert plain.detail is None
         splat = np.asarray(detailed.detail.splat)[..., :3]
         np.testing.assert_allclose(splat, plain.rgba[..., :3], rtol=4e-3, atol=1e-4)
-    freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, only_missing=True), quiet())
+    freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, only_missing=True), quiet())
     assert files(bare) == whole, "asked for plates, none of the old frames is right"
-    freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, only_missing=True, detail="off"), quiet())
+    freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, only_missing=True, detail="off"), quiet())
     assert not list((bare / "warp").glob("*.exr")), "warps of frames that are gone are gone"
 
 
 def test_single_frame_equals_the_same_frame_in_a_range(trained, take, quiet):
-    world, _ = trained
-    freeze_shot(world.shot, FreezeParams(take="one", **{**RANGE, "first": 107, "last": 107}), quiet())
-    one, whole = files(world.shot.take("one")), files(take[0])
+    freeze_shot(trained.shot, FreezeParams(take="one", **{**RANGE, "first": 107, "last": 107}), quiet())
+    one, whole = files(trained.shot.take("one")), files(take[0])
     assert len(one) == 3
     assert all(whole[name] == content for name, content in one.items())
 
@@ -138,16 +135,15 @@ freeze_shot(Shot.open(sys.argv[1]), FreezeParams(take=sys.argv[2], t_star=105, f
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
 def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
     """The process was killed after it had written a warp but not its frame."""
-    world, _ = trained
     name = "killed"
-    words = ["-P", "-c", CHILD, str(world.shot.root), name, str(ROOT)]
+    words = ["-P", "-c", CHILD, str(trained.shot.root), name, str(ROOT)]
     done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    folder = world.shot.take(name)
+    folder = trained.shot.take(name)
     left = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
     assert sorted(left) == ["000103.exr", "000104.exr", "000105.exr"]
     assert (folder / "warp" / "000106.exr").is_file()
-    freeze_shot(world.shot, FreezeParams(take=name, **RANGE, only_missing=True), quiet())
+    freeze_shot(trained.shot, FreezeParams(take=name, **RANGE, only_missing=True), quiet())
     assert files(folder) == files(take[0])
     assert all((folder / n).stat().st_mtime_ns == time for n, time in left.items())
     facts = [json.loads((f / "take.json").read_text())["detail"] for f in (folder, take[0])]
@@ -156,30 +152,28 @@ def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
 
 
 def test_frame_without_its_warp_is_rendered_again(trained, take, quiet):
-    world, _ = trained
     ask = FreezeParams(take="torn", **{**RANGE, "last": 104}, only_missing=True)
-    freeze_shot(world.shot, ask, quiet())
-    folder = world.shot.take("torn")
+    freeze_shot(trained.shot, ask, quiet())
+    folder = trained.shot.take("torn")
     before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
     (folder / "warp" / "000104.exr").unlink()
-    freeze_shot(world.shot, ask, quiet())
+    freeze_shot(trained.shot, ask, quiet())
     assert (folder / "warp" / "000104.exr").is_file()
     after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
     assert [name for name in after if after[name] != before[name]] == ["000104.exr"]
 
 
 def test_a_painted_matte_makes_frames_stale(trained, quiet):
-    world, _ = trained
     ask = FreezeParams(take="painted", develop="off", t_star=105, first=110, last=110, only_missing=True)
-    path = world.shot.root / PAINTED / "000110.png"
+    path = trained.shot.root / PAINTED / "000110.png"
     before = path.read_bytes()
     try:
         keys = []
         for matte in (None, None, np.full((48, 64), STILL, np.uint8)):
             if matte is not None:
                 write_matte(path, matte)
-            freeze_shot(world.shot, ask, quiet())
-            keys.append(read_key(world.shot.take("painted") / "000110.exr"))
+            freeze_shot(trained.shot, ask, quiet())
+            keys.append(read_key(trained.shot.take("painted") / "000110.exr"))
         assert keys[0] == keys[1] != keys[2]
     finally:
         path.write_bytes(before)
@@ -187,15 +181,14 @@ def test_a_painted_matte_makes_frames_stale(trained, quiet):
 
 def test_a_ramp_that_runs_is_the_clip(trained, quiet):
     """In frames at their own instant, pixels equal the plate up to half-float rounding. Later frames stay at 105."""
-    world, _ = trained
     ramp = {str(n): float(min(n, 105)) for n in range(101, 117)}
     part = dict(t_star_per_frame=ramp, first=104, last=106, develop="off")
-    freeze_shot(world.shot, FreezeParams(take="runs", **part), quiet())
-    plates = Plates(world.shot)
+    freeze_shot(trained.shot, FreezeParams(take="runs", **part), quiet())
+    plates = Plates(trained.shot)
     for n in (104, 105):
-        frame = read_frozen_exr(world.shot.take("runs") / f"{n:06d}.exr")
+        frame = read_frozen_exr(trained.shot.take("runs") / f"{n:06d}.exr")
         np.testing.assert_allclose(frame.rgba[..., :3], plates.linear(n), rtol=1e-3, atol=1e-6)
-    frozen = read_frozen_exr(world.shot.take("runs") / "000106.exr")
+    frozen = read_frozen_exr(trained.shot.take("runs") / "000106.exr")
     assert frozen.metadata.t_star_frame == 105.0 and (frozen.detail.source == 105).any()
 
 
