@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from tests.backend.pictures import write
+from tests.backend.quiet import Quiet
 from tests.backend.solved_room import again, solved, tools  # noqa: F401 - fixtures
 from torch_backend.contract import CameraFrame, CameraPath
 from torch_backend.footage.images import read_png, write_png
@@ -27,35 +28,6 @@ from torch_backend.shot import Shot, write_json
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 16
 FIRST = 101
-
-
-class Quiet:
-    """Reporter that records all events."""
-
-    def __init__(self, cancel_at: tuple[str, float] | None = None):
-        self.events: list[tuple] = []
-        self.cancel_at = cancel_at
-        self.cancelled = False
-
-    def progress(self, stage, done, total, message=""):
-        self.events.append(("progress", stage, done, total, message))
-        if self.cancel_at and stage == self.cancel_at[0] and done / total >= self.cancel_at[1]:
-            self.cancelled = True
-
-    def metric(self, stage, values):
-        self.events.append(("metric", stage, dict(values)))
-
-    def image(self, label, path):
-        self.events.append(("image", label, str(path)))
-
-    def warning(self, message, hint=""):
-        self.events.append(("warning", message, hint))
-
-    def check_cancelled(self):
-        from torch_backend.contract import Cancelled
-
-        if self.cancelled:
-            raise Cancelled
 
 
 @dataclass

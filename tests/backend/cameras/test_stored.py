@@ -133,7 +133,7 @@ def test_damaged_frame_is_detected_before_the_solve_and_reimported(solved, again
     cut(shot.frames / "raw/000107.png")
     (shot.frames / "raw/000109.png").unlink()
     with pytest.raises(JobError) as error:
-        solve_shot(shot, SolveConfig(features=1000), tools.recorder(cancel_at="solve: features"))
+        solve_shot(shot, SolveConfig(features=1000), tools.recorder(cancel_at=("solve: features", 0.0)))
     assert error.value.message == f"Damaged or missing in {shot.frames / 'raw'}: frames 107, 109."
     assert (error.value.hint, error.value.exit_code) == ("Import the clip again.", ExitCode.FOOTAGE)
     import_footage(shot, solved.shot.info().source, FootageConfig(step=2), tools.recorder())

@@ -119,7 +119,7 @@ def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(sh
     resumed = TrainParams(**{**vars(on_card), "width": 1920, "device": "cpu"})  # as Blender requests a paused run
     assert train_shot(shot, resumed, report)["width_px"] == 128
     assert any(event[0] == "progress" and "resumed at step" in event[4] for event in report.events)
-    warned = [event[1] for event in report.events if event[0] == "warning"]
+    warned = report.warnings
     assert warned[0] == "The run was started with the preset's settings for a graphics card, and continues with them."
     report = quiet()
     assert train_shot(shot, on_card, report)["width_px"] == 128

@@ -4,12 +4,12 @@ import copy
 import io
 import json
 import math
-import sys
 from dataclasses import dataclass
 
 import pytest
 import torch
 
+from tests.backend import conftest
 from tests.backend.trainings import take_steps
 from torch_backend.cli import Console
 from torch_backend.contract import Event, TrainParams
@@ -39,13 +39,11 @@ from torch_backend.train.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
-def long_world(tmp_path_factory, quiet):
+def long_world(tmp_path_factory):
     """(scene, images) of the tiny shot, extended so that it has probe frames."""
-    module = sys.modules[quiet.__module__]
-    patch = pytest.MonkeyPatch()
-    patch.setattr(module, "FRAMES", 30)
-    world = module.build_world(tmp_path_factory.mktemp("long"))
-    patch.undo()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conftest, "FRAMES", 30)
+        world = conftest.build_world(tmp_path_factory.mktemp("long"))
     scene = load_scene(world.shot)
     return scene, load_images(scene, scene.solved, 64, 48)
 

@@ -489,7 +489,7 @@ def test_take_is_finished_even_if_the_instant_cannot_be_stored(world, shot_copy,
     report = quiet()
     ask = dict(t_star=T_STAR, first=105, last=106, detail="off", grain=False)
     assert freeze_shot(shot, FreezeParams(**ask), report)["developed"] == [T_STAR]
-    warnings = [event[1] for event in report.events if event[0] == "warning"]
+    warnings = report.warnings
     assert (
         len(warnings) == 1
         and warnings[0].startswith("The developed instant was not saved:")

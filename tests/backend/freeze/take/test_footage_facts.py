@@ -9,7 +9,8 @@ import torch
 
 from tests.backend.footage.test_plates import solved
 from tests.backend.pictures import write
-from torch_backend.contract import PROBE, Reporter
+from tests.backend.quiet import Quiet
+from torch_backend.contract import PROBE
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png, write_png
@@ -19,10 +20,6 @@ from torch_backend.freeze.composite.warp import sample
 from torch_backend.freeze.take.footage_facts import footage_facts
 from torch_backend.lens.plate_lens import load_plate_lenses
 from torch_backend.shot import Shot
-
-
-class Quiet(Reporter):
-    """Reporter that discards all messages."""
 
 
 def pictures(folder, count=9, size=(96, 128), suffix="png", **attributes):
