@@ -81,7 +81,9 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def pictures() -> types.SimpleNamespace:
-    return types.SimpleNamespace(write=write_png, read=lambda path: pixels.read(path)[..., :3], srgb=srgb)
+    return types.SimpleNamespace(
+        write=write_png, png=make_shot.png, read=lambda path: pixels.read(path)[..., :3], srgb=srgb
+    )
 
 
 @pytest.fixture
