@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -22,7 +23,7 @@ from tests.backend.quiet import Quiet
 from tests.backend.solved_room import again, solved, tools  # noqa: F401 - fixtures
 from torch_backend.contract import CameraFrame, CameraPath
 from torch_backend.footage.images import read_png, write_png
-from torch_backend.motion.mattes import MOVING, PAINTED, STILL, write_matte
+from torch_backend.motion.mattes import MOVING, STILL, write_matte
 from torch_backend.raster import rasterize
 from torch_backend.shot import Shot, write_json
 
@@ -62,6 +63,18 @@ class World:
             background=torch.full((3,), 0.5),
         )
         return out.colors[0].clamp(0, 1)
+
+    def patch(self, frame: int, time: float) -> np.ndarray:
+        """[H, W]: coverage of the patch, from the pose of a frame, at a time."""
+        state = {name: value[self.moving] for name, value in self.at(time).items()}
+        pose = {"viewmats": self.viewmats[frame : frame + 1], "Ks": self.K[None]}
+        return rasterize(**state, **pose, width=WIDTH, height=HEIGHT).alphas[0].numpy()
+
+
+def outline(mask: np.ndarray) -> list[list[float]]:
+    """Polygon of the largest area of a mask, in pixels."""
+    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return (max(found, key=len)[:, 0] + 0.5).tolist()
 
 
 def film(world: World, folder: Path, picture: Callable[[int], np.ndarray], paint: bool = True, **config) -> Shot:
@@ -123,17 +136,9 @@ def build_world(root: Path) -> World:
 def paint_motion(world: World) -> None:
     """Paint motion mattes of the patch as an artist would: the patch moves too little for optical flow at this size."""
     for n in range(FRAMES):
-        state = world.at(n / (FRAMES - 1))
-        patch = rasterize(
-            **{name: value[world.moving] for name, value in state.items()},
-            viewmats=world.viewmats[n : n + 1],
-            Ks=world.K[None],
-            width=WIDTH,
-            height=HEIGHT,
-        )
-        path = world.shot.root / PAINTED / f"{FIRST + n:06d}.png"
+        path = world.shot.painted_matte(FIRST + n)
         path.parent.mkdir(exist_ok=True)
-        write_matte(path, np.where(patch.alphas[0].numpy() > 0.1, MOVING, STILL).astype(np.uint8))
+        write_matte(path, np.where(world.patch(n, n / (FRAMES - 1)) > 0.1, MOVING, STILL).astype(np.uint8))
 
 
 def _write(world: World) -> None:

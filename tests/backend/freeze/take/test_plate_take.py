@@ -25,7 +25,6 @@ from torch_backend.freeze.composite.state import StateConfig, let_go
 from torch_backend.freeze.composite.warp import apply_warp, read_warp
 from torch_backend.freeze.exr import read_frozen_exr, read_key
 from torch_backend.motion.mattes import PAINTED, STILL, write_matte
-from torch_backend.raster import rasterize
 from torch_backend.train import train_shot
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -255,13 +254,10 @@ LAMP = 20.0
 @pytest.fixture(scope="module")
 def lit(tmp_path_factory, world, quiet):
     """Trained shot of the wall in scene-linear EXR; its patch is a static lamp."""
-    lamp = {name: value[world.moving] for name, value in world.at(0.0).items()}
 
     def picture_of(n):
-        view = dict(viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
-        covered = rasterize(**lamp, **view).alphas[0].numpy() > 0.5
         picture = (0.8 * world.image(n, 0.0).numpy()) ** 2.2
-        picture[covered] = LAMP
+        picture[world.patch(n, 0.0) > 0.5] = LAMP
         return picture.astype(np.float16)
 
     shot = film(world, tmp_path_factory.mktemp("lit"), picture_of)
