@@ -284,7 +284,7 @@ def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
         before = len(trainer.model.gaussians)
         train_to_end(trainer, folder / "c.safetensors", lambda _: None)
         saved = (folder / "c.safetensors").is_file()
-    warnings = [event[1] for event in trainer.report.events if event[0] == "warning"]
+    warnings = trainer.report.warnings
     means = trainer.model.gaussians.params["means"]
     return {
         "iteration": trainer.iteration, "before": before, "after": len(trainer.model.gaussians), "saved": saved,
@@ -305,7 +305,7 @@ def bad_frames(folder: Path) -> dict[str, Any]:
             trainer.step()
         trainer.inspect_nonfinite()
         changed = [name for name, p in trainer.model.gaussians.params.items() if not bool((before[name] == p).all())]
-        warnings = [event[1] for event in trainer.report.events if event[0] == "warning"]
+        warnings = trainer.report.warnings
         for _ in range(12):
             trainer.step()
         try:
