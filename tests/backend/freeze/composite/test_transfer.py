@@ -5,18 +5,20 @@ import pytest
 import torch
 
 from torch_backend.footage.display import PLAIN, ROLLED
-from torch_backend.freeze.composite.transfer import straight_to_linear, to_display, to_linear
+from torch_backend.freeze.composite.transfer import display_of, light_of, straight_to_linear, to_display, to_linear
 
 VALUES = np.concatenate([np.linspace(-0.2, 1.2, 2801), np.geomspace(1.2, 60.0, 400), [0.0, 0.04045, 0.0031308]])
 
 
+@pytest.mark.parametrize("ways", [(to_linear, to_display), (light_of, display_of)], ids=["processor", "card"])
 @pytest.mark.parametrize("display", [PLAIN, ROLLED])
-def test_both_ways_are_those_of_files(display):
+def test_both_ways_are_those_of_files(display, ways):
+    to_light, to_shown = ways
     for value in (VALUES, -VALUES):
         x = value.astype(np.float32)
         shown = display.from_light(x)
-        np.testing.assert_allclose(to_linear(torch.from_numpy(shown), display), display.to_light(shown), rtol=4e-6)
-        np.testing.assert_allclose(to_display(torch.from_numpy(x), display), shown, rtol=2e-6, atol=1e-7)
+        np.testing.assert_allclose(to_light(torch.from_numpy(shown), display), display.to_light(shown), rtol=4e-6)
+        np.testing.assert_allclose(to_shown(torch.from_numpy(x), display), shown, rtol=2e-6, atol=1e-7)
 
 
 def test_the_curve_is_that_of_the_standard():
