@@ -229,7 +229,7 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     instants = torch.linspace(0, 1, 12, device=model.device)
     moves = [model.deltas(rows, instants[n : n + 1]) for n in range(len(instants))]
     places = torch.stack([move.means for move in moves if move is not None])
-    travel = norm(places - places.mean(0), 2).mean(0)
+    travel = norm(places - places.mean(0), dim=2).mean(0)
     support = model.gaussians.support[rows].float()
     seen = (travel[:, None] * support).sum(0) / travel.sum().clamp_min(1e-9)
     bins = [int((model.centres - float(t)).abs().argmin()) for t in times]

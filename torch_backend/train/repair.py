@@ -91,7 +91,7 @@ class FieldMemory:
         self._worst.zero_()
         self._reach.fill_(math.inf)
         if len(means):
-            around = norm(means - means.median(0).values, 1).median()
+            around = norm(means - means.median(0).values, dim=1).median()
             self._reach.copy_((_FAR * around).clamp(min(_LEAST_FAR, self.extent), self.extent))
 
     def state(self) -> dict[str, Tensor]:
