@@ -1,9 +1,10 @@
 """Densification within a budget: splits the Gaussians with the largest screen gradients, and prunes faint ones.
 
 Differences from 3DGS: a Gaussian's gradient in a view is the sum of absolute values over its pixels, so that opposite
-gradients do not cancel (AbsGS, Ye et al. 2024). Its score is the mean over the views that show it. Growth follows a schedule towards a budget instead of a threshold, so the cost of a run is known before it starts. A
-Gaussian is split along its longest axis into two that keep its second moment. Gaussians are not cloned in place, since
-both clones would get the same gradient. Opacities are not reset.
+gradients do not cancel (AbsGS, Ye et al. 2024). Its score is the mean over the views that show it. Growth follows a
+schedule towards a budget instead of a threshold, so the cost of a run is known before it starts. A Gaussian is split
+along its longest axis into two that keep its second moment. Gaussians are not cloned in place, since both clones would
+get the same gradient. Opacities are not reset.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from .model import Gaussians
 from .rotations import rotation_matrices
 
 PRUNE_STOP = 0.9
-"""Share of the run at which pruning ends. The last tenth fine-tunes a fixed set of Gaussians: `train/average.py` averages
-parameters over it, and restarts whenever their number changes."""
+"""Share of the run at which pruning ends. The last tenth keeps its Gaussians: `train/average.py` averages parameters over
+it, and restarts whenever their number changes."""
 _SHRINK = 1.6
 """Ratio of the parent's standard deviation along the split axis to a child's (3DGS densify_and_split)."""
 

@@ -1,6 +1,6 @@
-"""Reference body of the rasteriser: plain torch, any float type and device, gradients by autograd.
+"""Reference backend of the rasteriser: plain torch, any float type and device, gradients by autograd.
 
-It favours clarity over speed and defines what every other body must compute; `constants.py` holds the rules.
+It favours clarity over speed and defines what every other backend must compute; `constants.py` holds the rules.
 Projection: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, section 4).
 """
 

@@ -269,7 +269,8 @@ class PaperView:
     state: dict[str, Tensor]
     """Deformed parameters of M Gaussians (means, quats, log_scales, opacity_logits, sh0)."""
     inside: Tensor
-    """bool [M] True if the centre is inside the camera's frustum. The paper calls the other Gaussians `hidden`."""
+    """bool [M] True if the centre is inside the camera's frustum. The paper calls the other Gaussians `hidden`;
+    `Gaussians.hidden` also holds occluded ones."""
     supervised: Tensor
     """bool [M] True if the view's image supervises the Gaussian (`well_supervised`)."""
 

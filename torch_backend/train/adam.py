@@ -101,9 +101,9 @@ class FusedAdam(torch.optim.Optimizer):
 
     - `rows=True`: the first axis is the Gaussian; `step(visible=...)` skips invisible rows and their moments.
     - `clamp=(low, high)`: the parameters are clamped to this range.
-    - `lr_unit_distance`: a row's learning rate is multiplied by max(1, L2 norm of the row) / `lr_unit_distance`, so that
-      means at different distances move by equally many pixels. Rows are means relative to the cameras' centre, the
-      scene's origin. 0: the same rate for all rows.
+    - `lr_unit_distance`: a row's learning rate is multiplied by max(1, L2 norm of the row) / `lr_unit_distance`. Means
+      at different distances from the cameras' centre, the scene's origin, then move by equally many pixels. 0: the same
+      rate for all rows.
 
     `applied` is 0-dim bool on the parameters' device: True if the last step was applied.
     """
@@ -322,7 +322,7 @@ class StepTable:
 
 
 def _factors(p: Tensor, group: dict[str, Any]) -> Tensor | None:
-    """Learning rate factor of each element by the group's `lr_unit_distance`, in the layout of `p`; None if that is 0."""
+    """Learning rate factor of each element of `p`, in its layout; None if the group has no `lr_unit_distance`."""
     if not group["lr_unit_distance"]:
         return None
     rows = p.detach().reshape(len(p), -1)

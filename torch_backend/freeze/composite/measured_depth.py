@@ -2,8 +2,8 @@
 
 Only one plate shows a mover at t*, so its depth cannot be triangulated; a depth map supplies it. Where a frozen frame
 shows the same splats as plate t*, their inverse depth and the map's are averaged, weighted by 1 / variance. The map's
-variance comes from its fit. The splats' variance is the variance of their difference from the map, minus the map's
-variance.
+variance is that of its frame's fit to the solve's points (`train/depth_fit.py`). The splats' variance is the variance
+of their difference from the map, minus the map's variance.
 """
 
 from __future__ import annotations

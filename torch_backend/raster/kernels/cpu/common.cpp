@@ -1,4 +1,4 @@
-// Precedes every stage of the CPU body: vectors of 16 floats, elementary functions and sums over lanes. `cpu_source.py`
+// Precedes every stage of the CPU backend: vectors of 16 floats, elementary functions and sums over lanes. `cpu_source.py`
 // documents names and units, and replaces the names between @ signs.
 
 typedef float F __attribute__((ext_vector_type(16)));
