@@ -216,7 +216,7 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     """Scores every trained frame as a candidate for t*: good frames show most movers and have a sharp plate.
 
     Gaussians are weighted by their travel, so that people count more than a flickering lamp. Frames near an end of the
-    clip get a slightly lower score.
+    clip get a slightly lower score. If nothing moves, the score is the rank of sharpness alone.
 
     Args:
         times: [S] normalised times of the trained frames.
@@ -236,6 +236,7 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     share = seen.cpu().numpy()[bins]
     end = np.minimum(np.arange(len(times)), np.arange(len(times))[::-1])
     inner = np.minimum(end / max(1.0, _ENDS * len(times)), 1.0)
+    # Weights set by hand, not measured. The movers shown count most, sharpness half; the ends decide between equals.
     scores = share / max(float(share.max()), 1e-6) + 0.5 * rank + 0.1 * inner
     figures = zip(scores.tolist(), share.tolist(), rank.tolist(), strict=True)
     return [CandidateInstant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(figures)]

@@ -20,8 +20,8 @@ from .model import Gaussians
 from .rotations import rotation_matrices
 
 PRUNE_STOP = 0.9
-"""Share of the run at which pruning ends. The last tenth keeps its Gaussians: `train/average.py` averages parameters over
-it, and restarts whenever their number changes."""
+"""Share of the run at which pruning ends. In the last tenth their number stays: `train/average.py` averages parameters
+over it, and restarts when the number changes."""
 _SHRINK = 1.6
 """Ratio of the parent's standard deviation along the split axis to a child's (3DGS densify_and_split)."""
 
