@@ -281,7 +281,10 @@ class Correction(Protocol):
     """Another measurement of the depth of movers (`measured_depth.InstantDepth`)."""
 
     def correction(self, view: Camera, inverse: Array, moving: Array) -> tuple[Array, Array]:
-        """(factor for the splats' inverse depth `inverse` [h, w] in a view, relative standard deviation of the result), [h, w] each."""
+        """(factor for the splats' inverse depth in a view, relative standard deviation of the result), [h, w] each.
+
+        inverse: [h, w] that inverse depth. moving: bool [h, w] where the splats move.
+        """
         ...
 
 
