@@ -236,7 +236,7 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     share = seen.cpu().numpy()[bins]
     end = np.minimum(np.arange(len(times)), np.arange(len(times))[::-1])
     inner = np.minimum(end / max(1.0, _ENDS * len(times)), 1.0)
-    # Weights set by hand, not measured. The movers shown count most, sharpness half; the ends decide between equals.
+    # Weights set by hand: the movers shown count most, sharpness half, the ends decide between nearly equal frames.
     scores = share / max(float(share.max()), 1e-6) + 0.5 * rank + 0.1 * inner
     figures = zip(scores.tolist(), share.tolist(), rank.tolist(), strict=True)
     return [CandidateInstant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(figures)]

@@ -20,8 +20,8 @@ from .model import Gaussians
 from .rotations import rotation_matrices
 
 PRUNE_STOP = 0.9
-"""Share of the run at which pruning ends. In the last tenth their number stays: `train/average.py` averages parameters
-over it, and restarts when the number changes."""
+"""Share of the run at which pruning ends. In the last tenth, `train/average.py` averages the parameters, and restarts
+when the number of Gaussians changes."""
 _SHRINK = 1.6
 """Ratio of the parent's standard deviation along the split axis to a child's (3DGS densify_and_split)."""
 
