@@ -329,7 +329,7 @@ def note_training_kernels(launches: Launches) -> None:
             ignored = torch.rand(shape[:2], generator=g) > 0.7
             ssim_cuda.photometric(image, target, 0.2, ignored).backward()
         leaves = [torch.nn.Parameter(torch.randn(*size, generator=g)) for size in ((70, 3), (1300, 4), (5,))]
-        options = [{"rows": True, "reach": 2.0}, {"clamp": (-0.5, 0.5)}, {"lr": 0.1}]
+        options = [{"rows": True, "lr_unit_distance": 2.0}, {"clamp": (-0.5, 0.5)}, {"lr": 0.1}]
         groups = [{"params": [leaf], **more} for leaf, more in zip(leaves, options, strict=True)]
         optimizer = adam.FusedAdam(groups, lr=0.01, kernel=True)
         for has_nan in (False, True, False):

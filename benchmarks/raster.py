@@ -1,7 +1,7 @@
 """Times the rasteriser on seeded workloads: `python -m benchmarks.raster [W0 W1 ...] [--json FILE]`.
 
-Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). Errors are measured by
-`benchmarks/numerics.py`.
+Rivals: `--reference` (the torch backend in float32) and `--peer MODULE` (see `benchmarks/peers`). Errors are measured
+by `benchmarks/numerics.py`.
 
 The workloads are those of `benchmarks/workload.py`. Bodies run alternately, round by round, so that other load on the
 machine affects all of them alike.

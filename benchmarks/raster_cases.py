@@ -14,7 +14,7 @@ from torch_backend.raster import RasterSettings
 
 @dataclass(frozen=True)
 class Case:
-    """One hard case: a scene, and the allowed errors of a float32 body against the oracle."""
+    """One hard case: a scene, and the allowed errors of a float32 backend against the reference."""
 
     build: Callable[[bool], Scene]
     """Builds the scene; with True, a small one for slow CPU fibers."""

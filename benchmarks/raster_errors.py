@@ -1,8 +1,8 @@
-"""Scenes for the rasteriser, and errors of a body against the float64 oracle.
+"""Scenes for the rasteriser, and errors of a backend against the float64 reference.
 
-Inputs are rounded to float32 before the oracle uses them, so that all errors come from the body. If a Gaussian's alpha
-at a pixel is within rounding of 1/255, one body may draw it and another skip it (a "flip"). Images and gradients are
-compared at pixels without flips; the share of the other pixels is reported.
+Inputs are rounded to float32 before the reference uses them, so that all errors come from the backend. If a Gaussian's
+alpha at a pixel is within rounding of 1/255, one backend may draw it and another skip it (a "flip"). Images and
+gradients are compared at pixels without flips; the share of the other pixels is reported.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ BODIES: dict[str, tuple[str, torch.dtype, str]] = {
     "reference": ("reference", torch.float64, "cpu"),
     "reference32": ("reference", torch.float32, "cpu"),
 }
-"""Body: backend, float type, device. `reference` in float64 is the oracle; `cuda` runs the CUDA kernels on CPU fibers,
-`gpu` the same on a GPU."""
+"""Name -> backend, float type, device. `reference` in float64 is the reference; `cuda` runs the CUDA kernels on CPU
+fibers, `gpu` the same on a GPU."""
 if importlib.util.find_spec("torch_backend.raster.cuda"):
     BODIES["cuda"] = ("cuda", torch.float32, "cpu")
     if torch.cuda.is_available():
@@ -126,12 +126,12 @@ def psnr(value: Tensor, truth: Tensor) -> float:
 
 @dataclass
 class Errors:
-    """Errors of one body against the oracle on one scene."""
+    """Errors of one backend against the reference on one scene."""
 
     flips: float
     """Share of pixels on different sides of the alpha cut."""
     image: float
-    """Largest |colour error| at pixels without flips, relative to the oracle's brightest channel (at least 1)."""
+    """Largest |colour error| at pixels without flips, relative to the reference's brightest channel (at least 1)."""
     psnr: float
     """PSNR in dB at pixels without flips, with this brightness as the peak."""
     psnr_all: float
@@ -141,8 +141,8 @@ class Errors:
     relative to at least 1 % of its gradient in an empty scene, because float32 knows T only as 1 - alpha."""
     out: RasterOutput
     grads: dict[str, Tensor]
-    oracle: RasterOutput
-    oracle_grads: dict[str, Tensor]
+    reference: RasterOutput
+    reference_grads: dict[str, Tensor]
 
     @property
     def gradient(self) -> float:
@@ -151,7 +151,7 @@ class Errors:
 
 
 def compare(scene: Scene, body: str, **options: Any) -> Errors:
-    """Runs `scene`, with inputs rounded to float32, on a body and on the oracle, and compares them."""
+    """Runs `scene`, with inputs rounded to float32, on a backend and on the reference, and compares them."""
     scene = scene.rounded()
     options = {"with_contributions": True} | options
     ran: list[tuple[RasterOutput, dict[str, Tensor]]] = []
@@ -159,23 +159,23 @@ def compare(scene: Scene, body: str, **options: Any) -> Errors:
         _, dtype, device = BODIES[name]
         leaves = scene.leaves(dtype, device)
         ran.append((scene.run(name, leaves, **options), leaves))
-    (out, leaves), (oracle, truth) = ran
-    gap = (out.alphas.detach().cpu().double() - oracle.alphas.detach()).abs()
+    (out, leaves), (reference, truth) = ran
+    gap = (out.alphas.detach().cpu().double() - reference.alphas.detach()).abs()
     same = gap < SAME_SIDE
-    for images in (out, oracle):
+    for images in (out, reference):
         scalar(images, same.to(images.alphas.device)).backward()
-    grads, oracle_grads = (
+    grads, reference_grads = (
         {n: leaf.grad for n, leaf in tensors.items() if leaf.grad is not None} for tensors in (leaves, truth)
     )
-    brightest = max(1.0, float(oracle.colors.detach().abs().amax())) if oracle.colors.numel() else 1.0
-    error = (out.colors.detach().cpu().double() - oracle.colors.detach()).abs() / brightest
+    brightest = max(1.0, float(reference.colors.detach().abs().amax())) if reference.colors.numel() else 1.0
+    error = (out.colors.detach().cpu().double() - reference.colors.detach()).abs() / brightest
     clean = error[same]
     gradients = {}
-    for name, value in oracle_grads.items():
-        floor = 1e-6  # below this the oracle's value is only rounding of zero
+    for name, value in reference_grads.items():
+        floor = 1e-6  # below this the reference's value is only rounding of zero
         if name == "background":
-            empty = torch.zeros_like(oracle.colors).requires_grad_()
-            blank = dataclasses.replace(oracle, colors=empty, alphas=oracle.alphas.detach(), depth_expected=None)
+            empty = torch.zeros_like(reference.colors).requires_grad_()
+            blank = dataclasses.replace(reference, colors=empty, alphas=reference.alphas.detach(), depth_expected=None)
             scalar(blank, same).backward()
             floor = 0.01 * float(empty.grad.sum((0, 1, 2)).norm())  # type: ignore[union-attr]
         difference = (grads[name].cpu().double() - value).norm()
@@ -188,8 +188,8 @@ def compare(scene: Scene, body: str, **options: Any) -> Errors:
         gradients=gradients,
         out=out,
         grads=grads,
-        oracle=oracle,
-        oracle_grads=oracle_grads,
+        reference=reference,
+        reference_grads=reference_grads,
     )
 
 

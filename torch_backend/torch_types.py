@@ -77,12 +77,12 @@ def on_gradient(values: Tensor, hook: Callable[[Tensor], None]) -> None:
     cast(Any, values).register_hook(hook)
 
 
-def norm(values: Tensor, dim: int, keepdim: bool = False) -> Tensor:
-    """Euclidean norm along an axis."""
+def norm(values: Tensor, *, dim: int, keepdim: bool = False) -> Tensor:
+    """Euclidean (L2) norm along the axis `dim`, a keyword: `norm(x, 1)` would read as an L1 norm."""
     return cast(Any, values).norm(dim=dim, keepdim=keepdim)
 
 
-def norm_1(values: Tensor, dims: tuple[int, ...]) -> Tensor:
+def norm_1(values: Tensor, *, dims: tuple[int, ...]) -> Tensor:
     """Sum of magnitudes along axes."""
     return cast(Any, torch.linalg).vector_norm(values, 1, dim=dims)
 

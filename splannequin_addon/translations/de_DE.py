@@ -890,7 +890,7 @@ MESSAGES: dict[str, str] = {
     "Try Again": "Erneut versuchen",
     "If a solve fails or is poor, try again with more features, more pairs of frames, another lens model or a global mapper. Each retry is reported; retries that cannot help are skipped": "Wenn eine Kameralösung scheitert oder schwach ist, es noch einmal versuchen: mit mehr Merkmalen, mehr Bildpaaren, einem anderen Objektivmodell oder einem globalen Mapper. Jeder Versuch wird gemeldet; Versuche, die nicht helfen können, entfallen",
     "Ignore": "Ignorieren",
-    "Mask of what is not part of the scene, in white: a logo, dirt, the hands of the crew. It is not matched, not trained on and not used to fill. One picture for all frames, a picture of a sequence, or a video": "Maske dessen, was nicht zur Szene gehört, in Weiß: ein Logo, Schmutz, Hände der Crew. Es wird nicht abgeglichen, nicht trainiert und nicht zum Füllen verwendet. Ein Bild für alle Einzelbilder, ein Bild einer Sequenz oder ein Video",
+    "Mask of what is not part of the scene, in white: a logo, dirt, the hands of the crew. Masked pixels are not matched, trained on, or used to fill. One picture for all frames, a picture of a sequence, or a video": "Maske dessen, was nicht zur Szene gehört, in Weiß: ein Logo, Schmutz, Hände der Crew. Maskierte Pixel werden nicht abgeglichen, nicht trainiert und nicht zum Füllen verwendet. Ein Bild für alle Einzelbilder, ein Bild einer Sequenz oder ein Video",
     "None": "Keine",
     "No mask": "Keine Maske",
     "One image for all frames, an image of a numbered sequence, or a video": "Ein Bild für alle Einzelbilder, ein Bild einer nummerierten Sequenz, oder ein Video",

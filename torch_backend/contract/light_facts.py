@@ -51,7 +51,8 @@ class LightFacts:
 
 
 def light_of_take(take: TakeFolder, key: str) -> LightFacts | None:
-    """Facts of the take's panorama with this key; None if a file is missing, damaged or does not match the other."""
+    """Facts of the take's panorama with this key; None if the JSON or the EXR is missing, damaged, or
+    they do not match."""
     try:
         facts = LightFacts.from_json(read_json(take.light_facts(key), SHORT_JSON))
         return facts if facts.picture == file_digest(take.light(key)) else None

@@ -76,7 +76,7 @@ def write_message(stream: BinaryIO, header: Mapping[str, Any], body: bytes | mem
 def read_message(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
     """The next message of a live session, as (header, body); None at the end of the stream.
 
-    ValueError on anything else than a message. The rest of the stream cannot be read then.
+    Raises ValueError if the bytes are not a message; the stream is then unusable.
     """
     start = _read_exactly(stream, _MESSAGE.size)
     if start is None:

@@ -296,9 +296,8 @@ class SolveParams:
         "sequence, a video, `alpha` (where the footage is transparent), `found` (what the import detected as "
         "burnt in) or `none`",
         label="Ignore",
-        tip="Mask of what is not part of the scene, in white: a logo, dirt, the hands of the crew. It is not "
-        "matched, not trained on and not used to fill. One picture for all frames, a picture of a sequence, or a "
-        "video",
+        tip="Mask of what is not part of the scene, in white: a logo, dirt, the hands of the crew. Masked pixels are "
+        "not matched, trained on, or used to fill. One picture for all frames, a picture of a sequence, or a video",
     )
     """Mask (white) of regions to ignore: a picture, a sequence, a video, `MASK_ALPHA` or `MASK_FOUND`. Empty: none."""
     people_mask: str = option(

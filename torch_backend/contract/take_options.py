@@ -29,13 +29,13 @@ class FreezeParams:
         flag="--t-star",
         metavar="N",
         help="frame at which time stands still",
-        words="suggested from support and sharpness",
+        words="chosen by how many movers it shows and how sharp it is",
         limit=Limit("t*", -FRAMES, FRAMES),
         label="t*",
         tip="Frame number of the clip at which time stands still. Keyframes are followed frame by frame: freeze, "
         "hold and release",
     )
-    """Frame number of the clip at which time stands still; None: suggested from support and sharpness."""
+    """Frame number of the clip at which time stands still; None: the best suggestion (`suggested_instants`)."""
     t_star_per_frame: dict[str, float] = field(
         default_factory=dict[str, float], metadata={"option": Option(limit=Limit("t* of a frame", -FRAMES, FRAMES))}
     )

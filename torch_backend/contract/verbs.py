@@ -204,7 +204,7 @@ class FarmWords:
         flag="--t-star",
         metavar="N,N",
         help="frames at which time stands still; each becomes a separate take",
-        words="one, suggested from support and sharpness",
+        words="one frame, chosen by how many movers it shows and how sharp it is",
     )
     """Instants of every shot, separated by commas; None: one suggested instant."""
     t_star_list: str = option(

@@ -348,7 +348,7 @@ def _radii(places: Tensor, published: bool) -> Tensor:
     if published or len(places) < 2:
         return torch.full_like(places[:, 0], max(0.1 * float(places.max() - places.min()), 1e-3))
     index = nearest(places, places, min(4, len(places)))[:, 1:]
-    return norm(places[index] - places[:, None], 2).mean(1).clamp_min(1e-3)
+    return norm(places[index] - places[:, None], dim=2).mean(1).clamp_min(1e-3)
 
 
 # ---------------------------------------------------------------------- stage one of the published host
@@ -369,7 +369,7 @@ class _Surrogates:
             points, colors = points[kept], colors[kept]
         # Mean spacing of the points: the common size of the balls.
         near = nearest(points, points, min(4, len(points)))[:, 1:]
-        spacing = norm(points[near] - points[:, None], 2).median().clamp_min(1e-3)
+        spacing = norm(points[near] - points[:, None], dim=2).median().clamp_min(1e-3)
         self.scale = nn.Parameter(spacing.log().reshape(1))
         self.params = {
             "means": nn.Parameter(points.clone()),
@@ -401,7 +401,7 @@ class _Surrogates:
             if bool(torch.isfinite(loss)):
                 self.optimizer.step()
                 if state["means"].grad is not None:
-                    self.pull += norm(state["means"].grad, 1)
+                    self.pull += norm(state["means"].grad, dim=1)
         field.place(self.params["means"].detach())
 
     def _state(self, frame: int, moving: bool) -> dict[str, Tensor]:

@@ -104,7 +104,7 @@ def change_of(
     opacity = model.params["opacity_logits"][rows]
     change = torch.zeros(len(rows), device=rows.device)
     for at, counted in zip(moments, counts, strict=True):
-        departure = norm(at.means - mean.means, 1) * pixels / config.pixels
+        departure = norm(at.means - mean.means, dim=1) * pixels / config.pixels
         if at.sh0 is not None and mean.sh0 is not None:
             departure = torch.maximum(departure, SH_C0 * (at.sh0 - mean.sh0).abs().amax((1, 2)) / config.color)
         if at.opacity_logits is not None and mean.opacity_logits is not None:

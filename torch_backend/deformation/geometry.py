@@ -83,7 +83,7 @@ def farthest_points(features: Tensor, count: int) -> Tensor:
         if not float(distance[index]) > 0.0:
             break
         picked.append(index)
-        distance = torch.minimum(distance, norm(features - features[index], 1))
+        distance = torch.minimum(distance, norm(features - features[index], dim=1))
     return torch.tensor(picked, dtype=torch.long, device=features.device)
 
 

@@ -20,7 +20,7 @@ def arap_energy(before: Tensor, after: Tensor) -> Tensor:
     count = min(_EDGES, len(before) - 1)
     index = nearest(before, before, count + 1)[:, 1:]
     old, new = before[index] - before[:, None], after[index] - after[:, None]
-    valid = norm(old.detach(), 2) < _EDGE_RADIUS
+    valid = norm(old.detach(), dim=2) < _EDGE_RADIUS
     valid[:, :_SURE_EDGES] = True
     rotation, usable = rigid_rotations(old.detach(), new.detach(), valid)
     gap = (new - old @ rotation.transpose(1, 2)).square().sum(2)

@@ -138,7 +138,10 @@ class Rehearsal:
 
 
 class Deformation(nn.Module):
-    """Deformation field of a host; `config` is its configuration. In our hosts, it passes no gradient to the means."""
+    """Deformation field of a host; `config` is its configuration.
+
+    No gradient reaches the means through a field, except with HexPlane's option `published`.
+    """
 
     config: Any
     rules: Mapping[str, Rule]

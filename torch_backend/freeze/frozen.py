@@ -213,7 +213,7 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     """Scores every trained frame as a candidate for t*: good frames show most movers and have a sharp plate.
 
     Gaussians are weighted by their travel, so that people count more than a flickering lamp. Frames near an end of the
-    clip get a slightly lower score.
+    clip get a slightly lower score. If nothing moves, the score is the rank of sharpness alone.
 
     Args:
         times: [S] normalised times of the trained frames.
@@ -226,13 +226,14 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     instants = torch.linspace(0, 1, 12, device=model.device)
     moves = [model.deltas(rows, instants[n : n + 1]) for n in range(len(instants))]
     places = torch.stack([move.means for move in moves if move is not None])
-    travel = norm(places - places.mean(0), 2).mean(0)
+    travel = norm(places - places.mean(0), dim=2).mean(0)
     support = model.gaussians.support[rows].float()
     seen = (travel[:, None] * support).sum(0) / travel.sum().clamp_min(1e-9)
     bins = [int((model.centres - float(t)).abs().argmin()) for t in times]
     share = seen.cpu().numpy()[bins]
     end = np.minimum(np.arange(len(times)), np.arange(len(times))[::-1])
     inner = np.minimum(end / max(1.0, _ENDS * len(times)), 1.0)
+    # Weights set by hand: the movers shown count most, sharpness half, the ends decide between nearly equal frames.
     scores = share / max(float(share.max()), 1e-6) + 0.5 * rank + 0.1 * inner
     figures = zip(scores.tolist(), share.tolist(), rank.tolist(), strict=True)
     return [CandidateInstant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(figures)]

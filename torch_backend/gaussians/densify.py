@@ -1,9 +1,10 @@
 """Densification within a budget: splits the Gaussians with the largest screen gradients, and prunes faint ones.
 
-Differences from 3DGS: the signal is the sum of absolute screen gradients, so that opposite gradients do not cancel.
-Growth follows a schedule towards a budget instead of a threshold, so the cost of a run is known before it starts. A
-Gaussian is split along its longest axis into two that keep its second moment. Gaussians are not cloned in place, since
-both clones would get the same gradient. Opacities are not reset.
+Differences from 3DGS: a Gaussian's gradient in a view is the sum of absolute values over its pixels, so that opposite
+gradients do not cancel (AbsGS, Ye et al. 2024). Its score is the mean over the views that show it. Growth follows a
+schedule towards a budget instead of a threshold, so the cost of a run is known before it starts. A Gaussian is split
+along its longest axis into two that keep its second moment. Gaussians are not cloned in place, since both clones would
+get the same gradient. Opacities are not reset.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from ..torch_types import norm
 from .model import Gaussians
 from .rotations import rotation_matrices
 
+PRUNE_STOP = 0.9
+"""Share of the run at which pruning ends. In the last tenth, `train/average.py` averages the parameters, and restarts
+when the number of Gaussians changes."""
 _SHRINK = 1.6
 """Ratio of the parent's standard deviation along the split axis to a child's (3DGS densify_and_split)."""
 
@@ -31,9 +35,9 @@ class DensifyConfig:
     start: float = 0.06
     """Share of the run at which growth begins."""
     stop: float = 0.5
-    """Share of the run at which growth ends; pruning continues."""
+    """Share of the run at which growth ends; pruning continues until `PRUNE_STOP`."""
     every: int = 100
-    """Iterations between two rounds."""
+    """Iterations between two rounds. `config_from_params` sets it to a 30th of the run, 50 to 100."""
     prune_opacity: float = 0.01
     """Opacity below which Gaussians are pruned (3DGS: 0.005)."""
     max_scale: float = 0.5
@@ -64,7 +68,11 @@ class Densifier:
         self.seen += visible
 
     def target(self, initial: int, progress: float) -> int:
-        """Number of Gaussians that the schedule allows at `progress` (0 to 1) of the run."""
+        """Number of Gaussians that the schedule allows at `progress` (0 to 1) of the run.
+
+        initial + (budget - initial) * sqrt(s), with s from 0 at `start` to 1 at `stop`: half of the growth is done
+        after a quarter of that time, so that new Gaussians still have most of the run to train.
+        """
         c = self.config
         share = min(max((progress - c.start) / (c.stop - c.start), 0.0), 1.0)
         return round(initial + (max(c.budget, initial) - initial) * math.sqrt(share))
@@ -96,8 +104,8 @@ class Densifier:
         finite &= torch.isfinite(p["quats"]).all(1) & torch.isfinite(p["opacity_logits"])
         opaque = torch.sigmoid(p["opacity_logits"]) > self.config.prune_opacity
         largest = p["log_scales"].amax(1)
-        reach = norm(p["means"], 1)
-        return finite & opaque & (largest < math.log(self.config.max_scale) + torch.log(reach.clamp_min(1.0)))
+        distance = norm(p["means"], dim=1)  # from the cameras' centre, the scene's origin
+        return finite & opaque & (largest < math.log(self.config.max_scale) + torch.log(distance.clamp_min(1.0)))
 
     def _choose(self, score: Tensor, keep: Tensor, room: int) -> Tensor:
         chosen = torch.zeros_like(keep)

@@ -207,7 +207,7 @@ class Seen:
 
 
 def neighbours(matches: Matches, key: int, count: int, config: FlowConfig) -> list[Seen]:
-    """Positions of `key`'s points in the keys around it; keys are 0 to `count` - 1."""
+    """Where key frame `key`'s points lie in neighbouring key frames; key frames are numbered 0 to `count` - 1."""
     result: list[Seen] = []
     for side in (-1, 1):
         last = None

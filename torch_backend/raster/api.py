@@ -20,14 +20,14 @@ def _shape(name: str, value: Tensor, expected: tuple[int | str, ...]) -> None:
         raise ValueError(f"{name} must have shape [{dimensions}], not {list(value.shape)}")
 
 
-def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, body: str) -> None:
-    """Raise ValueError for invalid cameras. Values on a GPU are not checked for `body` 'cuda', to avoid a stall."""
+def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, backend: str) -> None:
+    """Raise ValueError for invalid cameras. Values on a GPU are not checked for `backend` 'cuda', to avoid a stall."""
     _shape("viewmats", viewmats, ("C", 4, 4))
     _shape("Ks", Ks, (viewmats.shape[0], 3, 3))
     if not 1 <= width <= SIDE_MAX or not 1 <= height <= SIDE_MAX:
         raise ValueError(f"width and height must be 1 to {SIDE_MAX}, not {width} x {height}")
     # Reading values on a GPU would stall it. There, invalid cameras give an empty image.
-    on_host = [value for value in (viewmats, Ks) if body != "cuda" or not value.is_cuda]
+    on_host = [value for value in (viewmats, Ks) if backend != "cuda" or not value.is_cuda]
     if not all(bool(torch.isfinite(value).all()) for value in on_host):
         raise ValueError("viewmats and Ks must be finite")
     if any(value is Ks for value in on_host) and not bool((Ks[:, [0, 1], [0, 1]] > 0).all()):
@@ -78,8 +78,8 @@ def _sh_degree(sh: Tensor | None, rest: Tensor | None, degree: int | None) -> in
     return degree
 
 
-def _body(backend: str, means: Tensor) -> str:
-    """Name of the body to run: 'cpu', 'cuda' or 'reference'."""
+def _resolved(backend: str, means: Tensor) -> str:
+    """Name of the backend to run: 'cpu', 'cuda' or 'reference'."""
     if backend not in ("auto", "cpu", "cuda", "reference"):
         raise ValueError(f"backend must be 'auto', 'cpu', 'cuda' or 'reference', not {backend!r}")
     device = means.device.type
@@ -95,11 +95,11 @@ def _body(backend: str, means: Tensor) -> str:
     return device if backend == "auto" else backend
 
 
-def _run(body: str, scene: Scene) -> RasterOutput:
-    """Run a body on a scene."""
-    if body == "reference":
+def _run(backend: str, scene: Scene) -> RasterOutput:
+    """Run a backend on a scene."""
+    if backend == "reference":
         return reference.rasterize(scene)
-    if body == "cuda":
+    if backend == "cuda":
         from . import cuda  # only when needed, because the import of Warp is slow
 
         return cuda.rasterize(scene)
@@ -134,7 +134,7 @@ def rasterize(
     Colour of `sh`: the harmonics in the direction from camera to mean, plus 0.5, floored at 0, without ceiling. A
     gradient passes the floor if descending it would raise the colour. With both, the output has the 3 channels of `sh`
     first, then those of `colors`. `sh_degree` limits the degree. If degree 0 is a separate tensor, for example for an
-    optimiser with two rates, pass sh [N, 1, 3] and sh_rest [N, K - 1, 3]: the CPU body then copies neither.
+    optimiser with two rates, pass sh [N, 1, 3] and sh_rest [N, K - 1, 3]: the CPU backend then copies neither.
 
     Cameras: viewmats [C, 4, 4] world to camera, OpenCV axes; Ks [C, 3, 3] px, pixel centres at +0.5, no skew.
     background is [D], or None for black. `with_depth`, `with_contributions` (weight_sum, weight_max) and `with_top`
@@ -150,18 +150,18 @@ def rasterize(
     also on the GPU, and it can be captured as a CUDA graph with its backward pass (see `cuda.py`). Cameras on the GPU
     are therefore not checked; non-finite values or non-positive focal lengths give an empty image.
 
-    Raises ValueError for invalid arguments, NotImplementedError for a device without a body, RuntimeError if Warp
+    Raises ValueError for invalid arguments, NotImplementedError for a device without a backend, RuntimeError if Warp
     cannot use the GPU.
 
     Source: Kerbl et al. 2023, "3D Gaussian Splatting"; Zwicker et al. 2001, "EWA Volume Splatting"; opacity
     compensation: Yu et al. 2024, "Mip-Splatting"; |gradient|: Ye et al. 2024, "AbsGS".
     """
-    body = _body(backend, means)
-    _check_camera(viewmats, Ks, width, height, body)
+    backend = _resolved(backend, means)
+    _check_camera(viewmats, Ks, width, height, backend)
     degree = _sh_degree(sh, sh_rest, sh_degree)
-    if sh is not None and sh_rest is not None and (body != "cpu" or not sh_rest.shape[1]):
+    if sh is not None and sh_rest is not None and (backend != "cpu" or not sh_rest.shape[1]):
         sh, sh_rest = torch.cat([sh, sh_rest[:, : (degree + 1) ** 2 - 1]], dim=1), None
-    dtype = means.dtype if body == "reference" else torch.float32
+    dtype = means.dtype if backend == "reference" else torch.float32
 
     def ready(value: Tensor) -> Tensor:
         return value.to(device=means.device, dtype=dtype).contiguous()
@@ -174,7 +174,7 @@ def rasterize(
         colors=None if colors is None else ready(colors),
         sh=None if sh is None else ready(sh),
         viewmats=ready(viewmats),
-        Ks=ready(Ks.detach()) if body == "cuda" else Ks.detach().to("cpu", torch.float64),
+        Ks=ready(Ks.detach()) if backend == "cuda" else Ks.detach().to("cpu", torch.float64),
         background=None if background is None else ready(background),
         width=width,
         height=height,
@@ -186,4 +186,4 @@ def rasterize(
         sh_rest=None if sh_rest is None else ready(sh_rest),
     )
     _check_scene(scene)
-    return _run(body, scene)
+    return _run(backend, scene)

@@ -1,4 +1,4 @@
-"""Constants and rules of culling, blending and projection that every rasteriser body follows.
+"""Constants and rules of culling, blending and projection that every backend of the rasteriser follows.
 
 Culling (per Gaussian and camera). A Gaussian is kept if all tests hold; each test is phrased so that NaN fails it:
   finite parameters; ``log_scales <= LOG_SCALE_MAX``; largest quaternion component > ``QUAT_MIN``; camera depth > near;
@@ -6,7 +6,7 @@ Culling (per Gaussian and camera). A Gaussian is kept if all tests hold; each te
   ellipse ``alpha >= ALPHA_MIN`` meets the rectangle of the image's pixel centres.
 Blending (per pixel, front to back by camera depth, ties by index):
   skip where alpha < ``ALPHA_MIN``; clamp alpha to ``ALPHA_MAX`` (no gradient through the clamp); stop once the
-  transmittance *before* a Gaussian is <= ``T_STOP``.
+  transmittance *before* a Gaussian is <= ``T_STOP``, so the Gaussian that crosses it counts (3DGS leaves it out).
 Projection: EWA with ``LOW_PASS`` px^2 added to the diagonal. For the Jacobian, x/z and y/z are clamped to the frustum
 widened by ``FRUSTUM_MARGIN`` half-widths on each side, with zero gradient outside. The frustum's limits are relative to
 the principal point.
@@ -14,13 +14,14 @@ the principal point.
 
 import math
 
-# As in Kerbl et al. 2023, like the two constants below: less than one step of an 8-bit image.
+# As in Kerbl et al. 2023, like the numbers of the two constants below: less than one step of an 8-bit image.
 ALPHA_MIN = 1.0 / 255.0
 """A Gaussian is skipped at a pixel where its alpha is below this."""
 ALPHA_MAX = 0.99
 """Upper clamp of alpha, so that 1 - alpha stays positive."""
 T_STOP = 1e-4
-"""(1 - ALPHA_MAX)^2: a pixel is finished once its transmittance is at or below this."""
+"""(1 - ALPHA_MAX)^2: a pixel is finished once its transmittance is at or below this. The number is that of Kerbl et
+al., the rule is not: see above."""
 # As in 3DGS: it makes every Gaussian at least about one pixel wide.
 LOW_PASS = 0.3
 """Variance in px^2 added to both diagonal entries of every projected covariance."""

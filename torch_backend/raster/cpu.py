@@ -1,4 +1,4 @@
-"""CPU body of the rasteriser: C++ snippets compiled by Warp, run by Python threads over chunks and tiles.
+"""CPU backend of the rasteriser: C++ snippets compiled by Warp, run by Python threads over chunks and tiles.
 
 The backward pass is explicit. `native.py` compiles and runs the snippets; `warm_up` compiles them in advance.
 """
@@ -208,7 +208,7 @@ class _Context(AutogradContext, Protocol):
 
 
 class _Rasterize(torch.autograd.Function):
-    """Autograd function of the CPU body. Tensors are float32, contiguous, on the CPU."""
+    """Autograd function of the CPU backend. Tensors are float32, contiguous, on the CPU."""
 
     @staticmethod
     def forward(

@@ -1,4 +1,4 @@
-"""C++ source of the CPU body (`kernels/cpu/*.cpp`), assembled as text for `warp.func_native`.
+"""C++ source of the CPU backend (`kernels/cpu/*.cpp`), assembled as text for `warp.func_native`.
 
 The code works on vectors of 16 floats (`F`), which Clang lowers to AVX-512, AVX2 or NEON. It cannot call libc. One
 parameter block `P` (fields below, mirrored by a ctypes structure) carries pointers and sizes, so that a launch passes

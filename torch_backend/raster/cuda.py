@@ -1,4 +1,4 @@
-"""CUDA body of the rasteriser: kernels compiled by Warp, an explicit backward pass, no synchronisation with the host.
+"""CUDA backend of the rasteriser: kernels compiled by Warp, an explicit backward pass, no synchronisation with host.
 
 It needs no CUDA toolkit: Warp brings the compiler and caches its output. CPU tensors run the same kernels on Warp's CPU
 fibers: slow, for tests on machines without a GPU. `hit_lists.py` determines the capacity of the list of hits.
@@ -297,7 +297,7 @@ class _Context(AutogradContext, Protocol):
 
 
 class _Rasterize(torch.autograd.Function):
-    """Autograd function of the CUDA body. Tensors are float32, contiguous, on one device."""
+    """Autograd function of the CUDA backend. Tensors are float32, contiguous, on one device."""
 
     @staticmethod
     def forward(
@@ -387,7 +387,9 @@ class _Rasterize(torch.autograd.Function):
 
 
 def warm_up(channels: int = 3, device: torch.device | str = "cuda") -> None:
-    """Compile, or load from the cache, the kernels for images of `channels` channels (one more with depth) on `device`.
+    """Compile, or load from the cache, the kernels for images on `device`.
+
+    `channels`: colour channels, plus one if depth is rendered.
 
     Raises RuntimeError with what to do if Warp cannot use the GPU.
     """

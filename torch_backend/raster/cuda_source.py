@@ -1,4 +1,4 @@
-"""C++ of the CUDA body (`kernels/cuda/*.cu`) for `warp.func_native`: NVRTC compiles it for GPUs, Clang for CPU fibers.
+"""C++ of the CUDA backend (`kernels/cuda/*.cu`) for `warp.func_native`. NVRTC compiles it for GPUs, Clang for fibers.
 
 It follows the rules of `constants.py` and the formulas of `kernels/cpu`: a record holds A, k, R (the conic with
 completed squares), and gradients are computed via xc, yy and k. One thread works on one Gaussian, a block of BLOCK

@@ -1,6 +1,6 @@
-"""Reference body of the rasteriser: plain torch, any float type and device, gradients by autograd.
+"""Reference backend of the rasteriser: plain torch, any float type and device, gradients by autograd.
 
-It favours clarity over speed and defines what every other body must compute; `constants.py` holds the rules.
+It favours clarity over speed and defines what every other backend must compute; `constants.py` holds the rules.
 Projection: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, section 4).
 """
 
@@ -74,7 +74,7 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations [N, 3, 3] of quaternions [N, 4] wxyz of any non-zero norm."""
     quats = quats / quats.detach().abs().amax(-1, keepdim=True)  # avoids underflow and overflow of the norm's squares
-    w, x, y, z = (quats / norm(quats, -1, keepdim=True)).unbind(-1)
+    w, x, y, z = (quats / norm(quats, dim=-1, keepdim=True)).unbind(-1)
     return torch.stack(
         (
             1 - 2 * (y * y + z * z),
@@ -125,7 +125,7 @@ def _colors(scene: Scene, index: Tensor, means: Tensor, viewmat: Tensor) -> Tens
     if scene.sh is not None:
         position = -viewmat[:3, :3].T @ viewmat[:3, 3]
         dirs = means - position
-        basis = sh_basis(dirs / norm(dirs, -1, keepdim=True), scene.sh_degree)
+        basis = sh_basis(dirs / norm(dirs, dim=-1, keepdim=True), scene.sh_degree)
         coefficients = scene.sh[index][:, : basis.shape[1]]
         parts.append(applied(_FloorAtZero, torch.einsum("nk,nkd->nd", basis, coefficients) + 0.5))
     if scene.colors is not None:
@@ -284,7 +284,7 @@ def _blend(p: _Projected, batch: _Batch, transmittance: Tensor) -> tuple[Tensor,
             for total, (s, dx, t, dy) in zip(totals, slopes, strict=True):
                 # Absolute per pixel, so that opposite gradients do not cancel (AbsGS, Ye et al. 2024).
                 pixel = grad * (s.detach() * dx.detach() + t.detach() * dy.detach())
-                total.index_add_(0, members.flatten(), norm_1(pixel, (1, 2)).flatten())
+                total.index_add_(0, members.flatten(), norm_1(pixel, dims=(1, 2)).flatten())
 
         on_gradient(exponent, gather)
     opacity = (p.opacity[members] * batch.valid)[:, None]
@@ -403,9 +403,9 @@ def _watch_gradients(p: _Projected, gradient: Tensor, absgradient: Tensor) -> No
         return
 
     def write(grad: Tensor) -> None:
-        gradient.zero_()[p.index] = norm(grad, -1)
+        gradient.zero_()[p.index] = norm(grad, dim=-1)
         if p.absgrad is not None:
-            absgradient.zero_()[p.index] = norm(p.absgrad, -1)
+            absgradient.zero_()[p.index] = norm(p.absgrad, dim=-1)
             p.absgrad.zero_()
 
     on_gradient(p.mean2d, write)

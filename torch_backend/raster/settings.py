@@ -23,7 +23,7 @@ class RasterSettings:
     """Extra pixels around the camera's frame: on the left and on the right, above and below. The Jacobian is clamped to
     the frame's frustum, so overscan does not change the pixels within the frame."""
     threads: int = field(default_factory=default_threads)
-    """Worker threads of the CPU body. The result is bitwise the same for any number."""
+    """Worker threads of the CPU backend. The result is bitwise the same for any number."""
 
 
 @dataclass
@@ -59,13 +59,13 @@ class RasterOutput:
     top_weights: Tensor | None = None
     """[C, H, W]: the largest alpha T at the pixel; 0 where alpha is 0. No gradient."""
     hits: Tensor | None = None
-    """[2] int64, CUDA body only: number of (Gaussian, tile) pairs of the call, and capacity of its list. If the first
-    exceeds the second, the call was slower but correct (`hit_lists.py`)."""
+    """[2] int64, CUDA backend only: number of (Gaussian, tile) pairs of the call, and capacity of its list. If the
+    first exceeds the second, the call was slower but correct (`hit_lists.py`)."""
 
 
 @dataclass
 class Scene:
-    """Validated inputs of one call, passed to the bodies."""
+    """Validated inputs of one call, passed to the backends."""
 
     means: Tensor
     quats: Tensor
@@ -75,7 +75,7 @@ class Scene:
     sh: Tensor | None
     viewmats: Tensor
     Ks: Tensor
-    """float64 on the CPU; for the CUDA body float32 on the device."""
+    """float64 on the CPU; for the CUDA backend float32 on the device."""
     background: Tensor | None
     width: int
     height: int
@@ -85,7 +85,7 @@ class Scene:
     with_contributions: bool
     with_top: bool = False
     sh_rest: Tensor | None = None
-    """Harmonics above degree 0, [N, K - 1, 3], if `sh` is [N, 1, 3]. The CPU body reads both without copying."""
+    """Harmonics above degree 0, [N, K - 1, 3], if `sh` is [N, 1, 3]. The CPU backend reads both without copying."""
 
     @property
     def channels(self) -> int:

@@ -124,7 +124,7 @@ def lens_of(camera: pycolmap.Camera) -> tuple[str, int, int, list[float]]:
 
 
 def lens_doubt(request: Request, model: pycolmap.Reconstruction) -> str:
-    """`lens_verdict.doubt_of` for a model's lens."""
+    """Reason to doubt the lens of a COLMAP reconstruction (`lens_verdict.doubt_of`); empty if there is none."""
     return doubt_of(*lens_of(first_camera(model)), request.focal)
 
 

@@ -256,7 +256,7 @@ def _pairs(support: Tensor, lacking: Tensor, draws: Draws) -> tuple[Tensor, Tens
     at = (picked, chosen)
     valid &= support.any(1)[picked] & lacking[at]
     # Far pairs come first and fill the limit. Near pairs pull hardest, also on Gaussians whose object left: with
-    # weight 1, equal shares gave 22.96 dB instead of 24.39 (bundled clip, held out).
+    # weight 1, equal shares gave 22.96 dB, far pairs first 24.39 (bundled clip, held out).
     return picked, chosen, valid & (valid.cumsum(0) <= count)
 
 
@@ -269,7 +269,8 @@ class PaperView:
     state: dict[str, Tensor]
     """Deformed parameters of M Gaussians (means, quats, log_scales, opacity_logits, sh0)."""
     inside: Tensor
-    """bool [M] True if the centre is inside the camera's frustum. The paper calls the other Gaussians `hidden`."""
+    """bool [M] True if the centre is inside the camera's frustum. The paper calls the other Gaussians `hidden`;
+    `Gaussians.hidden` also holds occluded ones."""
     supervised: Tensor
     """bool [M] True if the view's image supervises the Gaussian (`well_supervised`)."""
 

@@ -58,6 +58,8 @@ def mark_hidden(
 ) -> None:
     """Marks the Gaussians of `rows` [M] that a frame cannot show: outside the frame, or behind its surface.
 
+    The paper calls only those outside the frame hidden. Here, occluded ones are hidden, too.
+
     Args:
         time_bin: int64 [1], on the model's device.
         state: the Gaussians at the frame's time.

@@ -101,8 +101,9 @@ class FusedAdam(torch.optim.Optimizer):
 
     - `rows=True`: the first axis is the Gaussian; `step(visible=...)` skips invisible rows and their moments.
     - `clamp=(low, high)`: the parameters are clamped to this range.
-    - `reach`: a row's learning rate is multiplied by max(1, L2 norm of the row) / `reach`, so that means at different
-      distances move by equally many pixels. 0: the same rate for all rows.
+    - `lr_unit_distance`: a row's learning rate is multiplied by max(1, L2 norm of the row) / `lr_unit_distance`. Means
+      at different distances from the cameras' centre, the scene's origin, then move by equally many pixels. 0: the same
+      rate for all rows.
 
     `applied` is 0-dim bool on the parameters' device: True if the last step was applied.
     """
@@ -117,7 +118,7 @@ class FusedAdam(torch.optim.Optimizer):
         kernel: bool | None = None,
     ) -> None:
         """`threads`: CPU threads (default: all cores). `kernel`: use the Warp kernel (default: only on a GPU)."""
-        usual = {"rows": False, "clamp": (-math.inf, math.inf), "reach": 0.0}
+        usual = {"rows": False, "clamp": (-math.inf, math.inf), "lr_unit_distance": 0.0}
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, **usual})
         self.threads, self.kernel = threads, kernel
         self.applied = torch.tensor(True, device="cpu")
@@ -321,11 +322,11 @@ class StepTable:
 
 
 def _factors(p: Tensor, group: dict[str, Any]) -> Tensor | None:
-    """Learning rate factor of each element by the group's `reach`, in the layout of `p`; None without `reach`."""
-    if not group["reach"]:
+    """Learning rate factor of each element of `p`, in its layout; None if the group has no `lr_unit_distance`."""
+    if not group["lr_unit_distance"]:
         return None
     rows = p.detach().reshape(len(p), -1)
-    factor = norm(rows, 1).clamp_min(1.0) / group["reach"]
+    factor = norm(rows, dim=1).clamp_min(1.0) / group["lr_unit_distance"]
     return torch.empty_like(p, memory_format=torch.preserve_format).copy_(factor.view(-1, *[1] * (p.dim() - 1)))
 
 

@@ -169,7 +169,7 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
     config.method, config.seed = params.method, params.seed
     config.iterations = params.iterations or config.iterations
     config.width = params.width or config.width
-    _rates_for(config)
+    _adapt_to_length(config)
     config.densify.budget = params.max_gaussians or config.densify.budget
     config.supervision.preset, config.supervision.detector = params.supervision, params.detector
     config.host = params.method if params.method in hosts() else params.host
@@ -192,7 +192,7 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
 _RATES_FOR = 3000
 
 
-def _rates_for(config: TrainConfig) -> None:
+def _adapt_to_length(config: TrainConfig) -> None:
     """Scales the Gaussians' learning rates and the densification interval to the length of the run."""
     scale = min(max(math.sqrt(_RATES_FOR / max(1, config.iterations)), 0.3), 1.5)
     for name in ("lr_means", "lr_means_end", "lr_scales", "lr_quats", "lr_sh0", "lr_sh_rest"):

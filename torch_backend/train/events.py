@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ..deformation import Deformation, Rehearsal, Start, field_box, host
+from ..gaussians import PRUNE_STOP
 from .losses import photometric
 from .movers import close_still, harden, on_trial
 from .optimizer import add_field, limit_harmonics
@@ -29,7 +30,7 @@ def _due_events(trainer: Trainer) -> None:
     if c.poses.on and not trainer.refined and trainer.progress >= c.poses.until:
         trainer.freeze_poses()
     is_due = trainer.iteration > 0 and trainer.iteration % c.densify.every == 0
-    if is_due and c.densify.start <= trainer.progress < 0.9:
+    if is_due and c.densify.start <= trainer.progress < PRUNE_STOP:
         if trainer.recorder is not None:
             trainer.recorder.forget()  # growth replaces the tensors that recordings use, and needs their memory
         trainer.densifier.step(
@@ -43,7 +44,7 @@ def _due_events(trainer: Trainer) -> None:
         # Repeated if GPU memory ran out in this step: while there is no field, the gate has not opened.
         if trainer.iteration == round(c.gate.start * c.iterations) and trainer.model.field is None:
             open_gate(trainer)
-        elif _on_trial(trainer):
+        elif _trial_is_due(trainer):
             harden_gate(trainer)
         elif trainer.iteration == round(c.densify.stop * c.iterations) and trainer.policy.facts.hardened is not None:
             trainer.inspect_nonfinite()
@@ -61,9 +62,11 @@ def open_gate(trainer: Trainer) -> None:
         _create_field(trainer)
 
 
-def _on_trial(trainer: Trainer) -> bool:
-    """True if the trial is judged at this step: at `harden`, and then at intervals until a Gaussian moves or the run
-    reaches `give_up`."""
+def _trial_is_due(trainer: Trainer) -> bool:
+    """True if the trial (`movers.on_trial`) is judged at this step.
+
+    That is at `harden`, and then at intervals until a Gaussian moves or the run reaches `give_up`.
+    """
     c = trainer.config
     if trainer.model.field is None or trainer.policy.facts.hardened is not None:
         return False

@@ -114,7 +114,7 @@ def travelled(places: Tensor, viewmat: Tensor, K: Tensor) -> Tensor:
     low = torch.where(known[..., None], pixels, torch.inf).amin(0)
     high = torch.where(known[..., None], pixels, -torch.inf).amax(0)
     fine = (known.sum(0) >= 2) & ((depth > 1e-2) | ~known).all(0)
-    return torch.where(fine, norm(high - low, 1), 0.0)
+    return torch.where(fine, norm(high - low, dim=1), 0.0)
 
 
 @torch.no_grad()

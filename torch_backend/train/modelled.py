@@ -37,7 +37,7 @@ def modelled(trainer: Trainer) -> list[dict[str, Any]]:
         rows.append(_row("exposure", detail, size=4 * values.numel(), gain=facts.exposure_gain_db))
     if c.poses.on:
         values = trainer.poses.values
-        turn = float(norm(values.detach()[:, :3], 1).mean()) * float(trainer.Ks[0, 0, 0])
+        turn = float(norm(values.detach()[:, :3], dim=1).mean()) * float(trainer.Ks[0, 0, 0])
         detail = f"{len(values)} cameras, turned by {turn:.2f} px on average"
         rows.append(_row("poses", detail, size=4 * values.numel(), gain=facts.poses_gain_db))
     if model.field is not None:

@@ -36,7 +36,7 @@ def optimizer_of(model: DynamicModel, poses: Poses, config: TrainConfig) -> Fuse
         for name, (start, end) in rates.items()
     ]
     groups[list(rates).index("log_scales")]["clamp"] = _LOG_SCALE_RANGE
-    groups[list(rates).index("means")]["reach"] = c.lr_means_reach
+    groups[list(rates).index("means")]["lr_unit_distance"] = c.lr_means_reach
     lr = c.exposure.lr
     groups.append({"params": [model.exposure.values], "lr": lr, "lr_start": lr, "lr_end": 0.1 * lr})
     if c.poses.on:

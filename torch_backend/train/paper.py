@@ -88,7 +88,8 @@ def _view(run: RenderedRun, state: dict[str, Tensor], frame: int, rows: Tensor, 
 
 
 def inside_frustum(means: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:
-    """bool [M] True for `means` [M, 3] in front of the camera and inside its image. The paper calls others *hidden*."""
+    """bool [M] True for `means` [M, 3] in front of the camera and inside its image. The paper calls others *hidden*;
+    `Gaussians.hidden` also holds occluded ones."""
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = camera[:, 2].clamp_min(1e-6)
     x = camera[:, 0] / depth * K[0, 0] + K[0, 2]

@@ -71,8 +71,8 @@ class FieldMemory:
         self.extent = extent
         """Extent of the scene in scene units; a larger displacement is always too far."""
         self._kept: list[dict[str, Tensor]] = []  # the newest last
-        # Never reallocated, since recorded steps read `_reach` and write `_worst` (`recorder`).
-        self._reach = torch.full((), math.inf, device=device)
+        # Never reallocated, since recorded steps read `_limit` and write `_worst` (`recorder`).
+        self._limit = torch.full((), math.inf, device=device)
         self._worst = torch.zeros((), device=device)
         self.rates = 1.0
         """Factor of the field's learning rates, halved each time that the field is restored."""
@@ -89,23 +89,23 @@ class FieldMemory:
             for name, p in named.items():
                 self._kept[-1][name].copy_(p)
         self._worst.zero_()
-        self._reach.fill_(math.inf)
+        self._limit.fill_(math.inf)
         if len(means):
-            around = norm(means - means.median(0).values, 1).median()
-            self._reach.copy_((_FAR * around).clamp(min(_LEAST_FAR, self.extent), self.extent))
+            around = norm(means - means.median(0).values, dim=1).median()
+            self._limit.copy_((_FAR * around).clamp(min(_LEAST_FAR, self.extent), self.extent))
 
     def state(self) -> dict[str, Tensor]:
         """Tensors for a checkpoint, with which a resumed run makes the same repairs as an uninterrupted one."""
         kept = {f"{_STATE}kept.{n}.{name}": p for n, copy in enumerate(self._kept) for name, p in copy.items()}
-        return {f"{_STATE}reach": self._reach, f"{_STATE}worst": self._worst, **kept}
+        return {f"{_STATE}reach": self._limit, f"{_STATE}worst": self._worst, **kept}
 
     @torch.no_grad()
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Inverse of `state`."""
         stored = {name.removeprefix(_STATE): t for name, t in tensors.items() if name.startswith(_STATE)}
-        self._reach.copy_(stored["reach"])
+        self._limit.copy_(stored["reach"])
         self._worst.copy_(stored["worst"])
-        device, kept = self._reach.device, [f"kept.{n}." for n in range(2)]
+        device, kept = self._limit.device, [f"kept.{n}." for n in range(2)]
         found = [
             {name.removeprefix(start): t.to(device, copy=True) for name, t in stored.items() if name.startswith(start)}
             for start in kept
@@ -120,7 +120,7 @@ class FieldMemory:
 
     def is_too_far(self, shift: Tensor) -> Tensor:
         """bool [M] Gaussians whose displacement `shift` [M, 3], in scene units, is too far."""
-        return shift.abs().amax(1) > self._reach
+        return shift.abs().amax(1) > self._limit
 
     def of(self, name: str, p: Tensor) -> Tensor | None:
         """Stored value of parameter `name`; None if it is missing or its shape is not that of `p`."""

@@ -294,13 +294,13 @@ def _loss(device: torch.device) -> list[Check]:
 
 
 def _adam(device: torch.device) -> list[Check]:
-    """Compares two Adam steps with a `reach`, on rows at different distances."""
+    """Compares two Adam steps with an `lr_unit_distance`, on rows at different distances."""
     g = torch.Generator(device="cpu").manual_seed(5)
     start, *gradients = torch.randn(3, 5000, 3, generator=g, device="cpu")
     found: list[Tensor] = []
     for run_device, kernel in ((torch.device("cpu"), False), (device, True)):
         parameter = torch.nn.Parameter(start.to(run_device, copy=True))
-        optimizer = FusedAdam([{"params": [parameter], "reach": 2.0}], lr=0.1, kernel=kernel)
+        optimizer = FusedAdam([{"params": [parameter], "lr_unit_distance": 2.0}], lr=0.1, kernel=kernel)
         for gradient in gradients:
             parameter.grad = gradient.to(run_device)
             optimizer.step()

@@ -17,7 +17,7 @@ def ran(scene, body, where=1.0, **options):
 
 
 @on_compiled_bodies
-def test_room_matches_the_oracle(small_room, body):
+def test_room_matches_the_reference(small_room, body):
     # A pixel at the alpha threshold may fall on either side. Few do, and gradients are compared on the other pixels.
     with torch.no_grad():
         same = (on_host(small_room.run(body)).alphas - small_room.run("reference").alphas).abs() < 3e-5

@@ -1,4 +1,4 @@
-"""The compiled CPU implementation, compared with the float64 reference."""
+"""The CPU backend alone; test_bodies.py compares images and gradients of every backend with the float64 reference."""
 
 import os
 import subprocess

@@ -31,7 +31,7 @@ def assert_case(case, body):
     finite."""
     bound, errors = CASES[case], compare(size(case, body), body)
     assert_sane(errors.out, errors.grads)
-    assert_sane(errors.oracle, errors.oracle_grads)
+    assert_sane(errors.reference, errors.reference_grads)
     assert errors.flips <= bound.flips
     assert errors.psnr >= bound.psnr
     if bound.gradient is not None:
@@ -240,7 +240,7 @@ def test_no_gradient_passes_the_frustum_clamp(tools, body):
     scene.tensors["log_scales"] += torch.tensor([0.0, 0.2, 0.5])
     assert abs(1.4 / 1.5) > 0.65
     errors = compare(scene, body)
-    assert float(errors.oracle_grads["means"].norm()) > 1e-3
+    assert float(errors.reference_grads["means"].norm()) > 1e-3
     assert errors.gradients["means"] < 1e-4
 
 

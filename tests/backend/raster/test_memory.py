@@ -75,20 +75,20 @@ print(peak() - start, out.weight_sum.item() / alpha, leaves["colors"].grad[0, 0]
 @on_every_program
 def test_ten_thousand_gaussians_in_one_pixel_take_memory_by_the_gaussian(body):
     count = 500 if body == "cuda" else 10_000
-    oracle = body not in COMPILED
-    count *= 4 if oracle else 1
+    is_reference = body not in COMPILED
+    count *= 4 if is_reference else 1
     grown, _, _ = in_a_child(
         f"""
 scene = size("10,000 Gaussians in one pixel", body)
 for name in scene.tensors.keys() - {{"viewmats", "background"}}:
-    scene.tensors[name] = torch.cat([scene.tensors[name]] * {4 if oracle else 1})
+    scene.tensors[name] = torch.cat([scene.tensors[name]] * {4 if is_reference else 1})
 out, grads = scene.gradients(body)
 print(peak() - start, 0, 0)
 """,
         body,
     )
     # The reference blends 2^20 (pixel, Gaussian) pairs at once; its forty tensors exceed the ten thousand Gaussians.
-    step = 40 * 2**20 * BODIES[body][1].itemsize if oracle else 64e6
+    step = 40 * 2**20 * BODIES[body][1].itemsize if is_reference else 64e6
     assert grown <= 4096 * count + step
 
 

@@ -274,19 +274,19 @@ def test_any_numbers_give_sane_images_and_gradients(example, body):
 
 
 @for_all(scenes(), 250)
-def test_bodies_agree_with_the_oracle_on_any_scene(scene, body):
+def test_bodies_agree_with_the_reference_on_any_scene(scene, body):
     errors = compare(scene, body)
     assert_sane(scene, errors.out, errors.grads)
-    gap = (errors.out.alphas.detach().cpu() - errors.oracle.alphas.detach()).abs()
+    gap = (errors.out.alphas.detach().cpu() - errors.reference.alphas.detach()).abs()
     assert (gap <= len(scene.tensors["means"]) * ALPHA_MIN + 2e-3).all()
     assert errors.image <= 2e-3
 
 
 @for_all(good_scenes(), 250)
-def test_gradients_agree_with_the_oracle_on_good_scenes(scene, body):
+def test_gradients_agree_with_the_reference_on_good_scenes(scene, body):
     errors = compare(scene, body)
     assert errors.image <= 5e-4
-    for name, truth in errors.oracle_grads.items():
+    for name, truth in errors.reference_grads.items():
         difference = (errors.grads[name].cpu().double() - truth).norm()
         assert difference <= 2e-3 * truth.norm() + 1e-3, name
 

@@ -61,13 +61,13 @@ def test_two_hundred_steps_match_torch(kernel):
 
 @pytest.mark.parametrize("kernel", BODIES)
 def test_a_row_twice_as_far_moves_twice_as_fast(kernel):
-    reach = 4.0
+    unit_distance = 4.0
     ours = parameters()[:4]
     with torch.no_grad():
         for p in ours:  # from below one unit, which counts as one, to a hundred
             p.mul_(torch.logspace(-2, 2, len(p)).view(-1, *[1] * (p.dim() - 1)))
     theirs = [torch.nn.Parameter(p.detach().double()) for p in ours]
-    fused = FusedAdam([{**g, "reach": reach} for g in groups(ours)], eps=1e-15, kernel=kernel)
+    fused = FusedAdam([{**g, "lr_unit_distance": unit_distance} for g in groups(ours)], eps=1e-15, kernel=kernel)
     reference = torch.optim.Adam([{k: v for k, v in g.items() if k != "rows"} for g in groups(theirs)], eps=1e-15)
     generator = torch.Generator().manual_seed(1)
     for _ in range(50):
@@ -79,7 +79,7 @@ def test_a_row_twice_as_far_moves_twice_as_fast(kernel):
         reference.step()
         for q, was in zip(theirs, before, strict=True):
             length = was.reshape(len(was), -1).norm(dim=1).clamp_min(1.0).view(-1, *[1] * (was.dim() - 1))
-            q.data = was + (q.data - was) * length / reach
+            q.data = was + (q.data - was) * length / unit_distance
     for p, q in zip(ours, theirs, strict=True):
         assert float(((p.detach() - q.detach()).abs() / q.detach().abs().clamp_min(1.0)).max()) < 2e-5
 

@@ -263,7 +263,7 @@ def bound_between(trainer: Trainer, count: int) -> torch.Tensor:
     far = farthest(trainer)
     first, second = far.sort(descending=True).values[count - 1 : count + 1]
     assert first > second
-    trainer.soundness.memory._reach.fill_(float(first + second) / 2)
+    trainer.soundness.memory._limit.fill_(float(first + second) / 2)
     return far >= first
 
 

@@ -207,7 +207,7 @@ def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetVi
     """[...] in 0..1: similarity of the viewing directions of plate t* and the frame at points [..., 3]."""
     theirs = source_views.centres[source_views.index[target.t]]
     a, b = (points - centre.to(points.device) for centre in (theirs, target.centre))
-    cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
+    cosine = (a * b).sum(-1) / (norm(a, dim=-1) * norm(b, dim=-1)).clamp_min(1e-9)
     angle = torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
     return (2.0 - 2.0 * angle / config.max_mover_angle).clamp(0.0, 1.0)
 
@@ -232,7 +232,7 @@ def _unmoved(
 ) -> Tensor:
     """[...] in 0..1: similarity of movers in plate `frame` to t*: high if the model explains them and flow is short."""
     view = source_views.view(frame)
-    travel = norm(project(points, view.viewmat, view.K)[0] - visibility.pixels, -1)
+    travel = norm(project(points, view.viewmat, view.K)[0] - visibility.pixels, dim=-1)
     trust = torch.exp(-travel / (config.sway * source_views.unit))
     return visibility.explained * trust
 

@@ -2,8 +2,8 @@
 
 Only one plate shows a mover at t*, so its depth cannot be triangulated; a depth map supplies it. Where a frozen frame
 shows the same splats as plate t*, their inverse depth and the map's are averaged, weighted by 1 / variance. The map's
-variance comes from its fit. The splats' variance is the variance of their difference from the map, minus the map's
-variance.
+variance is that of its frame's fit to the solve's points (`train/depth_fit.py`). The splats' variance is the variance
+of their difference from the map, minus the map's variance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,17 @@ from numpy.typing import NDArray
 from ...scene import Scene, resize_intrinsics
 from ...train import LoadedRun
 from ..frozen import FrozenGaussians, render_frozen
-from .surface_depth import LEAST_INVERSE, SAME, TO_SIGMA, KeyView, SurfaceDepthConfig, rays_of, seen_in
+from .surface_depth import (
+    LEAST_DEPTH,
+    LEAST_INVERSE,
+    SAME,
+    TO_SIGMA,
+    Camera,
+    DepthView,
+    SurfaceDepthConfig,
+    rays_of,
+    seen_in,
+)
 
 Array = NDArray[Any]
 """Array of float32, if not stated otherwise."""
@@ -33,23 +43,24 @@ _AROUND = 15
 class InstantDepth:
     """Depth map of plate t*, for one frozen instant."""
 
-    splats: KeyView
+    splats: DepthView
     """Plate t*'s camera, with the inverse depth of the instant's splats."""
-    measured: KeyView
+    measured: DepthView
     """Plate t*'s camera, with the map's inverse depth and its standard deviation."""
     splat_noise: float
     """Relative standard deviation of the inverse depth of moving splats."""
     noise: float
     """Relative standard deviation of the inverse depth of static splats."""
 
-    def correction(self, view: KeyView, moving: Array) -> tuple[Array, Array]:
+    def correction(self, view: Camera, inverse: Array, moving: Array) -> tuple[Array, Array]:
         """(factor for the inverse depth of a frame's splats, relative standard deviation of the result), [h, w] each.
 
         Args:
-            view: the frame's camera with its splats' inverse depth [h, w].
+            view: the frame's camera.
+            inverse: [h, w] inverse depth of the frame's splats.
             moving: bool [h, w], True where the splats move; elsewhere the factor is 1.
         """
-        rays, inverse = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
+        rays, inverse = rays_of(view.K, inverse.shape), np.maximum(inverse, LEAST_INVERSE).astype(np.float32)
         splat_inverse, _ = seen_in(self.splats, view, rays, inverse)
         found, sigma = seen_in(self.measured, view, rays, inverse)
         relative_sigma = np.maximum(sigma / np.maximum(found, LEAST_INVERSE), 1e-4)
@@ -99,7 +110,7 @@ class MeasuredDepths:
         i, (height, width) = scene.frames.index(frame), found.shape[1:]
         K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
         image = render_frozen(frozen, scene.viewmats[i], K, width, height).cpu()
-        splats = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
+        splats = (1.0 / image.depth.clamp(LEAST_DEPTH, 1.0 / LEAST_INVERSE)).numpy()
         inverse, sigma = found.numpy()
         has_depth = inverse > 0
         moving = has_depth & (image.motion.numpy() > 0.5)
@@ -111,10 +122,9 @@ class MeasuredDepths:
         pose = scene.viewmats[i].double().numpy(), K.double().numpy()
         # Holes of the map get the splats' depth with a standard deviation above `_UNKNOWN`.
         measured = np.where(has_depth, inverse, splats), np.where(has_depth, sigma, 10.0 * splats)
-        none = np.zeros_like(splats)
         return InstantDepth(
-            KeyView(*pose, none, none, splats, self.config.noise * splats),
-            KeyView(*pose, none, none, *(a.astype(np.float32) for a in measured)),
+            DepthView(*pose, splats, self.config.noise * splats),
+            DepthView(*pose, *(a.astype(np.float32) for a in measured)),
             splat_noise,
             self.config.noise,
         )

@@ -46,7 +46,7 @@ def primary_plate(source_views: SourceViews, output: OutputFrame, target: Target
     at = torch.tensor([source_views.index[frame] for frame in usable], device="cpu")
     solid = target.depth[target.depth < 1e9]
     depth = float(solid.median()) if len(solid) else 1.0
-    travel = norm(source_views.centres[at] - target.centre, 1) / max(depth, 1e-6)
+    travel = norm(source_views.centres[at] - target.centre, dim=1) / max(depth, 1e-6)
     turned = 1.0 - source_views.scene.viewmats[at][:, 2, :3] @ output.viewmat[2, :3]
     return usable[first_least([float(value) for value in travel + turned], 1e-5)]
 

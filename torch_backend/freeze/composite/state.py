@@ -134,5 +134,5 @@ def _travel(source_views: SourceViews, target: TargetView, frame: int) -> Tensor
     moved, points = displacements(source_views, target, [frame], size)[0], target.points[::2, ::2]
     view = source_views.view(frame)
     ends = project(points + moved, view.viewmat, view.K)[0]
-    travel = norm(ends - project(points, view.viewmat, view.K)[0], -1) / source_views.unit
+    travel = norm(ends - project(points, view.viewmat, view.K)[0], dim=-1) / source_views.unit
     return resized(travel, w, h)

@@ -43,6 +43,8 @@ from .planes import Array, Planes, fit_planes, grid_of, smoothed, window_means
 LEAST_INVERSE = 1e-4
 """Smallest inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so surfaces farther
 than 10,000 units have no parallax."""
+LEAST_DEPTH = 1e-4
+"""Smallest depth, in scene units: a guard against division by zero."""
 TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation for Gaussian errors."""
 SAME = 3.0
@@ -64,20 +66,18 @@ class SurfaceDepthConfig:
     keys: int = VIEWS
     """Number of key views, spread evenly over the clip."""
     around: int = 6
-    """Number of key views on either side with which a key view is compared. Also the number of nearest key views from
-    which a frame takes its depth."""
+    """Number of key views on either side with which a key view is compared."""
     steps: int = 4
     """Number of Gauss-Newton steps."""
     radii: tuple[int, ...] = (3, 8)
-    """Radii in pixels of the windows in which planes are fitted in key views. In a frame only the first is used; it is
-    also the spacing of the nine windows that each pixel averages."""
+    """Radii in pixels of the windows in which planes are fitted in key views. A frame uses `frame_radius`."""
     small: int = 2
     """Radius in pixels of the windows in which the noise of plates is measured, and a frame's splats are smoothed."""
     detail: float = 1.5
     """Standard deviation in pixels of the blur that is subtracted from plates, so that light and exposure cancel."""
     noise: float = 0.03
-    """Relative standard deviation of the splats' inverse depth: their median error is 1.2 to 1.8 % on the tuning
-    scenes arm-000 and arm-001."""
+    """Relative standard deviation of the splats' inverse depth. Their median error is 1.2 to 1.8 % on the tuning
+    scenes arm-000 and arm-001; 1.8 % times `TO_SIGMA` is 2.7 %, rounded up."""
     uneven: float = 0.1
     """Scale of a window's mean squared residual, in units of variance, at which its weight falls off."""
     outlier: float = 1e-6
@@ -86,23 +86,45 @@ class SurfaceDepthConfig:
     color: float = 0.1
     """Sigma of the colour difference between a pixel and a window, display-referred, in the bilateral filter."""
 
+    @property
+    def nearest(self) -> int:
+        """Number of nearest key views from which a frame takes its depth. It equals `around`; only that was tuned."""
+        return self.around
+
+    @property
+    def frame_radius(self) -> int:
+        """Radius in pixels of a frame's windows, and spacing of the nine windows that each pixel averages."""
+        return self.radii[0]
+
 
 @dataclass
-class KeyView:
-    """A frame of the clip at which static surfaces are measured, at `SurfaceDepthConfig.width`."""
+class Camera:
+    """A pinhole camera."""
 
     viewmat: NDArray[np.float64]
     """[4, 4] world-to-camera, scene units."""
     K: NDArray[np.float64]
     """[3, 3] pixels."""
+
+
+@dataclass
+class DepthView(Camera):
+    """Inverse depth that a camera sees."""
+
+    inverse: Array
+    """[h, w] inverse depth, in 1 / scene units."""
+    sigma: Array
+    """[h, w] standard deviation of `inverse`."""
+
+
+@dataclass
+class KeyView(DepthView):
+    """A frame of the clip at which static surfaces are measured, at `SurfaceDepthConfig.width`."""
+
     picture: Array
     """[h, w] high-passed brightness of its plate."""
     still: Array
     """[h, w] 1 where its plate shows a static surface, else 0."""
-    inverse: Array
-    """[h, w] inverse depth of the static surfaces, in 1 / scene units."""
-    sigma: Array
-    """[h, w] standard deviation of `inverse`."""
 
 
 class StillSurfaces:
@@ -113,8 +135,8 @@ class StillSurfaces:
         self.config, self.keys = config or SurfaceDepthConfig(), keys
         found: list[tuple[Array, Array]] = []
         for i, key in enumerate(keys):
-            reach = range(max(0, i - self.config.around), min(len(keys), i + self.config.around + 1))
-            found.append(refined(key, [keys[j] for j in reach if j != i], self.config))
+            compared = range(max(0, i - self.config.around), min(len(keys), i + self.config.around + 1))
+            found.append(refined(key, [keys[j] for j in compared if j != i], self.config))
         for key, (inverse, sigma) in zip(keys, found, strict=True):
             key.inverse, key.sigma = inverse, sigma
 
@@ -126,7 +148,7 @@ class StillSurfaces:
             offset = float(np.linalg.norm(-key.viewmat[:3, :3].T @ key.viewmat[:3, 3] - centre))
             return offset + float(np.linalg.norm(key.viewmat[2, :3] - viewmat[2, :3]))
 
-        return sorted(self.keys, key=distance)[: self.config.around]
+        return sorted(self.keys, key=distance)[: self.config.nearest]
 
 
 def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
@@ -141,7 +163,7 @@ def refined(key: KeyView, neighbours: Sequence[KeyView], config: SurfaceDepthCon
     """(inverse depth [h, w] of a key view at which plates agree, its standard deviation [h, w])."""
     start, inverse = key.inverse, key.inverse.copy()
     prior = 1.0 / np.square(start)  # relative error of 100 %: splats only count where plates have no texture
-    variance = 1.0 / prior
+    variance = 1.0 / prior  # the result if `steps` is 0
     for _ in range(config.steps if neighbours else 1):
         information, pull, parallax = gauss_newton(key, neighbours, inverse, config)
         weight = information + prior
@@ -175,11 +197,11 @@ def gauss_newton(
             continue
         count, square = window_means([weight, weight * np.square(shift)], config.small)
         noise = np.sqrt(np.maximum(square / np.maximum(count, 1e-6), _QUANTUM**2))
-        # Robust weight: beyond SAME standard deviations two plates show different points.
+        # Weight of Geman and McClure (1985): beyond SAME standard deviations two plates show different points.
         weight /= np.square(noise * (1.0 + np.square(shift / (SAME * noise))))
         # A slope within 8-bit quantisation noise carries no information on depth.
-        steps = np.square(_SURE * _SLOPE_NOISE * _QUANTUM) * (np.square(place.dx) + np.square(place.dy))
-        weight *= np.maximum(1.0 - steps / np.maximum(np.square(slope), 1e-20), 0.0)
+        quantisation = np.square(_SURE * _SLOPE_NOISE * _QUANTUM) * (np.square(place.dx) + np.square(place.dy))
+        weight *= np.maximum(1.0 - quantisation / np.maximum(np.square(slope), 1e-20), 0.0)
         information += weight * slope * slope
         pull -= weight * slope * shift
         np.maximum(parallax, np.where(seen, np.hypot(place.dx, place.dy), 0.0), out=parallax)
@@ -202,7 +224,7 @@ class Place:
     """[h, w] inverse depth in the other view; 0 behind its camera."""
 
     @classmethod
-    def of(cls, view: KeyView, target: KeyView, rays: Array, inverse: Array) -> Place:
+    def of(cls, view: Camera, target: Camera, rays: Array, inverse: Array) -> Place:
         """Projection of the points of `view` at inverse depth `inverse` [h, w] along `rays` [h, w, 3]."""
         turn, shift = between(view.viewmat, target.viewmat)
         points = rays @ turn.T + inverse[..., None] * shift
@@ -258,8 +280,11 @@ class Splats:
 class Correction(Protocol):
     """Another measurement of the depth of movers (`measured_depth.InstantDepth`)."""
 
-    def correction(self, view: KeyView, moving: Array) -> tuple[Array, Array]:
-        """(factor for the splats' inverse depth in a view, relative standard deviation of the result), [h, w] each."""
+    def correction(self, view: Camera, inverse: Array, moving: Array) -> tuple[Array, Array]:
+        """(factor for the splats' inverse depth in a view, relative standard deviation of the result), [h, w] each.
+
+        inverse: [h, w] that inverse depth. moving: bool [h, w] where the splats move.
+        """
         ...
 
 
@@ -283,36 +308,38 @@ def frame_depth(
     K = splats.K.copy()
     K[0] *= w / width
     K[1] *= h / height
+    view = Camera(splats.viewmat, K)
     still, mover = np.clip(1.0 - 2.0 * moving, 0.0, 1.0), moving > 0.5
     full_inverse, noise = splats.inverse, np.full_like(inverse, config.noise)
     if measured is not None:
-        factor, noise = measured.correction(KeyView(splats.viewmat, K, inverse, still, inverse, inverse), mover)
+        factor, noise = measured.correction(view, inverse, mover)
         inverse = np.asarray(inverse * factor, np.float32)
         factor = np.asarray(cv2.resize(factor, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
         full_inverse = np.where(splats.moving > 0.5, full_inverse * factor, full_inverse)
     sigma = noise * np.maximum(inverse, LEAST_INVERSE)
     inverse, _ = smoothed(inverse, 1.0 / np.square(sigma), (config.small,), config.uneven)  # single splats stick out
-    values, sigma = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, sigma))
+    values, sigma = combined(surfaces, DepthView(view.viewmat, view.K, inverse, sigma), still)
     # Movers and static surfaces are fitted separately, so that planes never span both.
     weight = 1.0 / np.square(np.maximum(sigma, LEAST_INVERSE * config.noise))
-    still, moved = (fit_planes(values, weight * (of + 1e-9), config.radii[0]) for of in (~mover, mover))
+    still, moved = (fit_planes(values, weight * (of + 1e-9), config.frame_radius) for of in (~mover, mover))
     planes = Planes(*(np.where(mover, *pair) for pair in zip(moved, still, strict=True)))
+    # In the filter's channels, movers and static surfaces are 4 sigma apart, so planes never mix them.
     guide = np.concatenate([picture, (4.0 * config.color * (splats.moving > 0.5))[..., None]], axis=2, dtype=np.float32)
     small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
     small = np.concatenate([small, (4.0 * config.color * mover)[..., None]], axis=2, dtype=np.float32)
     return selected(planes, sigma, small, full_inverse, guide, config)
 
 
-def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
+def combined(surfaces: StillSurfaces, view: DepthView, still: Array) -> tuple[Array, Array]:
     """(inverse depth, its standard deviation), [h, w] each: the value on which most key views and the splats agree.
 
-    `view` has the splats' inverse depth and its standard deviation. Only splats are used for movers.
+    `view` has the splats' inverse depth and its standard deviation. Only splats are used where `still` [h, w] is 0.
     """
     rays, splats = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
     seen = [(splats, view.sigma), *(seen_in(key, view, rays, splats) for key in surfaces.near(view.viewmat))]
     values, sigmas = (np.stack(rows) for rows in zip(*seen, strict=True))
     votes = (sigmas > 0).astype(np.float32)
-    votes[1:] *= (view.still > 0) / max(len(values) - 1, 1)  # key views share plates: together they have one vote
+    votes[1:] *= (still > 0) / max(len(values) - 1, 1)  # key views share plates: together they have one vote
     all_votes = np.maximum(votes.sum(0), 1e-12)
     variances = np.square(np.maximum(sigmas, 1e-4 * splats))
     densities, means, spreads = (np.zeros_like(values) for _ in range(3))
@@ -337,7 +364,7 @@ def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
     return mean.astype(np.float32), np.sqrt(variance).astype(np.float32)
 
 
-def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[Array, Array]:
+def seen_in(key: DepthView, view: Camera, rays: Array, inverse: Array) -> tuple[Array, Array]:
     """(inverse depth of a view's points, from a key view, its standard deviation), [h, w] each.
 
     The standard deviation is 0 where the key view has no depth. `inverse` [h, w] is the initial guess. A point's pixel
@@ -375,7 +402,7 @@ def selected(
     maps = [level, planes.along, planes.down, planes.fits(config.uneven), np.square(sigma)]
     rough = np.asarray(cv2.medianBlur(splats, 3), np.float32)
     out, deviation = filtered(
-        np.concatenate([np.stack(maps, axis=-1), small], axis=2), rough, picture, config.radii[0], config.noise,
+        np.concatenate([np.stack(maps, axis=-1), small], axis=2), rough, picture, config.frame_radius, config.noise,
         config.outlier, config.color, LEAST_INVERSE,
     )  # fmt: skip
     return np.where(splats > 0, out, 0.0), np.where(splats > 0, deviation, 0.0)
@@ -392,6 +419,7 @@ class FrameDepths:
     def surfaces(self) -> StillSurfaces:
         """The run's static surfaces. They do not depend on t*, so that the order of frames changes nothing."""
         if self._surfaces is None:
+            # Any time does: movers are faded out, and the others hardly depend on it.
             frozen = freeze_at(self.run.model, 0.5, span_of(self.scene, self.run))
             still = fade(frozen, (frozen.motion < 0.5).float())
             shot = Shot(self.scene.folder.parent)
@@ -416,11 +444,12 @@ class FrameDepths:
             measured: correction by the artist's depth map of the instant; None without a map.
         """
         has_depth = depth < NO_DEPTH
-        inverse = torch.where(has_depth, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE), 0.0)
+        inverse = torch.where(has_depth, 1.0 / depth.clamp(LEAST_DEPTH, 1.0 / LEAST_INVERSE), 0.0)
         splats = Splats(viewmat.double().numpy(), K.double().numpy(), inverse.numpy(), motion.numpy())
         clipped = picture.clamp(0.0, 1.0).numpy()
         found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, clipped, measured))
         refined = torch.where(has_depth, 1.0 / found.clamp_min(LEAST_INVERSE), NO_DEPTH)
+        # To first order, the standard deviation of z = 1 / rho is sigma_z = sigma_rho z^2.
         return refined, torch.where(has_depth, sigma * refined.square(), 0.0)
 
     def _key(self, shot: Shot, frame: int, still: FrozenGaussians) -> KeyView:
@@ -431,7 +460,7 @@ class FrameDepths:
         height = max(8, round(scene.height * width / scene.width))
         K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
         image = render_frozen(still, scene.viewmats[i], K, width, height).cpu()
-        inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
+        inverse = (1.0 / image.depth.clamp(LEAST_DEPTH, 1.0 / LEAST_INVERSE)).numpy()
         plate = read_image(shot.plate(frame), width, height, scene.display).numpy()
         moving = load_motion(shot, frame)
         clear = np.ones((height, width), np.float32)
@@ -439,5 +468,7 @@ class FrameDepths:
             moving = cv2.resize(moving, (width, height), interpolation=cv2.INTER_NEAREST)
             around = np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)
             clear[cv2.dilate(moving, around) > UNKNOWN] = 0.0
-        pose = scene.viewmats[i].double().numpy(), K.double().numpy()
-        return KeyView(*pose, key_picture(plate, self.config), clear, inverse, self.config.noise * inverse)
+        return KeyView(
+            scene.viewmats[i].double().numpy(), K.double().numpy(), inverse, self.config.noise * inverse,
+            picture=key_picture(plate, self.config), still=clear,
+        )  # fmt: skip

@@ -110,7 +110,7 @@ class _Pair:
         self.sways = config.sways * plates.width / 640
         """`StaticBaselineConfig.sways` in pixels of the compared plates."""
         places = frozen.state["means"][rows]
-        self.from_near = config.nearer * norm(places - plates.centre(t_star), -1)
+        self.from_near = config.nearer * norm(places - plates.centre(t_star), dim=-1)
         """[M] distance in scene units up to which a plate sees each of the rows from near."""
         self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, baseline)
         self.moved = torch.zeros(len(rows), dtype=torch.bool, device=movers.device)
@@ -165,7 +165,7 @@ class _Pair:
         sums = (first + second).reshape(len(self.rows), len(masks), 3)
         if then is None:
             return sums[:, 0, :2]
-        near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), -1) <= self.from_near
+        near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), dim=-1) <= self.from_near
         # A face that is six pixels wide in plate t* matches it with its eyes in any position. Near plates judge it on
         # all pixels.
         sums = torch.where(near[:, None], sums[:, 0], sums[:, 1])
@@ -181,7 +181,7 @@ class _Pair:
         pixels_now, pixels_then = (
             project(scene.state["means"][self.rows], viewmat, K)[0] for scene in (self.scenes[0], then)
         )
-        return norm(pixels_now - pixels_then, -1)
+        return norm(pixels_now - pixels_then, dim=-1)
 
     @torch.no_grad()
     def _render(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:

@@ -28,6 +28,6 @@ def undersampled(run: LoadedRun, scene: Scene, means: Tensor, t_star: float, tim
     of_bins = centres[[trained[i] for i in gaps.argmin(1)]].to(means.device)
     least = torch.full_like(means[:, 0], torch.inf)
     for of_bin, seen in zip(of_bins, model.gaussians.support[: len(means)].unbind(1), strict=True):
-        least = torch.where(seen, torch.minimum(least, norm(means - of_bin, -1)), least)
+        least = torch.where(seen, torch.minimum(least, norm(means - of_bin, dim=-1)), least)
     at = scene.nearest(t_star)
-    return norm(means - centres[at].to(means.device), -1) > times * least
+    return norm(means - centres[at].to(means.device), dim=-1) > times * least

@@ -166,14 +166,14 @@ def seen_from(
     are left out, see `LightConfig`. JobError if there are no splats around the point.
     """
     means = from_numpy(splats.means).double() - from_numpy(point)
-    distances = norm(means, -1)
+    distances = norm(means, dim=-1)
     unit = float(distances.median()) if len(distances) else 0.0
     if not unit > 0.0:
         raise JobError("The take has no splats around that point.", "Choose another point.", ExitCode.USAGE)
     means, distances = means / unit, distances / unit
     quats, log_scales = from_numpy(splats.quats), from_numpy(splats.log_scales).double() - np.log(unit)
     within = (means[:, None] @ rotation_matrices(quats.double()))[:, 0] / log_scales.exp().clamp_min(1e-12)
-    share = (distances / config.near - 1.0).clamp(0.0, 1.0) * (norm(within, -1) > config.inside)
+    share = (distances / config.near - 1.0).clamp(0.0, 1.0) * (norm(within, dim=-1) > config.inside)
     share = share * (log_scales.exp().amax(-1) < config.wide * distances)
     opacity = torch.sigmoid(from_numpy(splats.opacity_logits).double()) * share
     rows = share > 0.0
@@ -193,11 +193,11 @@ def _colors(sh: Tensor, means: Tensor, cameras: Tensor) -> Tensor:
     The nearest direction is the one with the smallest angle to the direction from the origin to the mean.
     """
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
-    directions = means / norm(means, -1, keepdim=True)
+    directions = means / norm(means, dim=-1, keepdim=True)
     best, along = torch.full((len(means),), -2.0), directions.clone()
     for camera in cameras if degree else ():
         ray = means - camera
-        ray = ray / norm(ray, -1, keepdim=True).clamp_min(1e-9)
+        ray = ray / norm(ray, dim=-1, keepdim=True).clamp_min(1e-9)
         cosine = (ray * directions).sum(-1)
         # Harmonics are arbitrary in directions in which no camera of the clip looked.
         along = torch.where((cosine > best)[:, None], ray, along)
@@ -242,7 +242,7 @@ def render_panorama(
     """
     focal, side = sphere.face_camera(config.width)
     K = torch.tensor([[focal, 0.0, side / 2.0], [0.0, focal, side / 2.0], [0.0, 0.0, 1.0]])
-    distances = norm(splats.means, -1)
+    distances = norm(splats.means, dim=-1)
     done = 0
 
     def face(rotation: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from torch_backend.freeze.composite.measured_depth import InstantDepth, MeasuredDepths
 from torch_backend.freeze.composite.surface_depth import (
-    KeyView,
+    Camera,
+    DepthView,
     Splats,
     StillSurfaces,
     SurfaceDepthConfig,
@@ -54,12 +55,11 @@ def instant(splat_error: float, sigma: float = 0.02, hole: bool = False) -> Inst
     if hole:
         measured[:, WIDTH // 2 :] = splats[:, WIDTH // 2 :]
         deviation[:, WIDTH // 2 :] = 10.0 * splats[:, WIDTH // 2 :]
-    none = np.zeros_like(splats)
     pose = camera(0.0), K
     noise = max(abs(splat_error), NOISE)
     return InstantDepth(
-        KeyView(*pose, none, none, splats, NOISE * splats),
-        KeyView(*pose, none, none, measured, deviation),
+        DepthView(*pose, splats, NOISE * splats),
+        DepthView(*pose, measured, deviation),
         noise,
         NOISE,
     )
@@ -70,8 +70,7 @@ def corrected(shift: float, splat_error: float, **more: Any) -> tuple[NDArray[An
     `shift`."""
     true, moving, _ = world(shift)
     splats = np.where(moving, true / (1.0 + splat_error), true).astype(np.float32)
-    view = KeyView(camera(shift), K, splats, splats, splats, splats)
-    factor, deviation = instant(splat_error, **more).correction(view, moving)
+    factor, deviation = instant(splat_error, **more).correction(Camera(camera(shift), K), splats, moving)
     ratio = true / (splats * factor)
     return ratio[moving], deviation[moving], ratio[~moving]
 
@@ -102,8 +101,7 @@ def test_what_plate_t_star_does_not_show_is_not_measured_by_it():
     """Behind the card, the map at t* holds the card's depth."""
     true, moving, _ = world(0.5)
     splats = np.where(moving, true / 1.06, true).astype(np.float32)
-    view = KeyView(camera(0.5), K, splats, splats, splats, splats)
-    factor, _ = instant(0.06).correction(view, moving)
+    factor, _ = instant(0.06).correction(Camera(camera(0.5), K), splats, moving)
     wrong = np.abs(factor[moving] - 1.03) > 0.1
     assert wrong.mean() < 0.03, "its outline mixes two surfaces; the card's factor would be 1.9"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -42,7 +41,7 @@ def view_of(shift: float, texture: NDArray[Any], wrong: float = 1.0) -> KeyView:
     K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
     inverse = (inverse * wrong).astype(np.float32)
     picture = key_picture(plate[..., None], SurfaceDepthConfig())
-    return KeyView(viewmat, K, picture, np.ones_like(inverse), inverse, 0.03 * inverse)
+    return KeyView(viewmat, K, inverse, 0.03 * inverse, picture, np.ones_like(inverse))
 
 
 @pytest.fixture(scope="module")
@@ -115,15 +114,15 @@ def test_key_views_that_agree_outvote_splats_that_are_wrong() -> None:
         viewmat = np.eye(4)
         viewmat[0, 3] = -shift
         still, value = np.ones_like(true), np.full_like(true, inverse)
-        return KeyView(viewmat, K, 0.0 * still, still, value, 0.004 * value)
+        return KeyView(viewmat, K, value, 0.004 * value, 0.0 * still, still)
 
     surfaces = StillSurfaces.__new__(StillSurfaces)
     surfaces.config, surfaces.keys = SurfaceDepthConfig(), [key(0.1, 0.2501), key(0.2, 0.2499), key(-0.1, 0.22)]
     view = key(0.0, 0.225)
     view.sigma = 0.03 * view.inverse
-    inverse, _ = combined(surfaces, view)
+    inverse, _ = combined(surfaces, view, view.still)
     middle = np.s_[8:-8, 16:-16]
     assert np.abs(inverse / true - 1.0)[middle].max() < 0.01
-    without_views = combined(surfaces, replace(view, still=0.0 * view.still))
+    without_views = combined(surfaces, view, 0.0 * view.still)
     np.testing.assert_allclose(without_views[0], view.inverse, rtol=1e-6)
     np.testing.assert_allclose(without_views[1], view.sigma, rtol=1e-3)

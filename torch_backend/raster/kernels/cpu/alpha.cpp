@@ -1,4 +1,4 @@
-// One row of one hit: alpha, weight, and the transmittance behind the hit.
+// Belongs inside the loop of `rows.cpp`; opens no block. Alpha, weight, and the transmittance behind the hit.
 
                 F e = LANE + shifts[l][row], before = T[row];
                 F p = fma(A * e, e, (F)levels[l][row]);

@@ -1,4 +1,4 @@
-// One row of one hit, backward.
+// Belongs inside the loop of `rows.cpp`; opens no block. Backward: `v` is w (G . c) - alpha / (1 - alpha) behind.
 #include "alpha.cpp"
 
                 float dy = dys[l][row];

@@ -1,4 +1,6 @@
-// Sixteen hits at a time: for each, the rows that it touches, as bits, and its ellipse on each of the 16 rows.
+// Belongs inside the loop over hits `b`, which it leaves once no pixel of the tile is unfinished. Opens no block.
+// Sixteen hits at a time: for each, the rows that it touches, as bits, and its ellipse on each of the 16 rows. `r` is a
+// record of `cpu_source.py`: r[0], r[1] mean x, y; r[2] A; r[3] k; r[4] R; r[5] log2 opacity.
 
         unsigned live = 0;
         for (int i = 0; i < 16; i++) live |= (unsigned)any(T[i] > T_STOP) << i;

@@ -1,5 +1,6 @@
-// Blend stage 1: backward, front to back, parallel over tiles. `left` is the part of d loss / d image . image that the
-// Gaussians behind still contribute.
+// Blend stage 1: backward, front to back, parallel over tiles. `left` is what the Gaussians behind still contribute to
+// sum_c G_c C_c - g_alpha T_final: C is the image with its background, G and g_alpha are gradients of image and alpha.
+// After a Gaussian of colour c, that is `behind`: d loss / d log alpha = w (G . c) - alpha / (1 - alpha) behind.
 #include "tile.cpp"
 
 const long long GS = P.grad_stride;

@@ -1,5 +1,5 @@
-// Precedes every stage of the CPU body: vectors of 16 floats, elementary functions and sums over lanes. `cpu_source.py`
-// documents names and units, and replaces the names between @ signs.
+// Precedes every stage of the CPU backend: vectors of 16 floats, elementary functions and sums over lanes.
+// `cpu_source.py` documents names and units, and replaces the names between @ signs.
 
 typedef float F __attribute__((ext_vector_type(16)));
 typedef int I __attribute__((ext_vector_type(16)));

@@ -1,4 +1,4 @@
-// One row of one hit, forward, without the parts for depth and top contributor.
+// Belongs inside the loop of `rows.cpp`; opens no block. Forward, without the parts for depth and top contributor.
 #include "alpha.cpp"
 
                 for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)channel[c], C[c][row]);

@@ -1,4 +1,4 @@
-// Precedes every stage of the CUDA body: names that differ between GPUs and Warp's CPU fibers, elementary functions.
+// Precedes every stage of the CUDA backend: names that differ between GPUs and Warp's CPU fibers, elementary functions.
 // `cuda_source.py` documents names and units, and replaces the names between @ signs.
 
 #if defined(__CUDA_ARCH__)
