@@ -120,7 +120,7 @@ def reason(scene: bpy.types.Scene) -> str:
     if _session is None or not _session.facts:
         return "The backend is loading the run."
     at = instant(scene)
-    shown = {frame.t_star for frame in _session.frames.values()}
+    shown = _session.instants()
     for rank, one in enumerate(suggestions()):
         if one["frame"] == at:
             share, sharp = round(100 * one["seen"]), round(100 * one["sharpness"])

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -93,6 +94,28 @@ def test_resting_view_is_requested_sharper_then_with_plate_detail(addon, contrac
     seq = session.wanted(1).seq
     session._take_in({"kind": "error", "seq": seq, "message": "no plates", "hint": ""}, b"")
     assert look(t_star=8.0) is None and session.open, "not asked for over and over"
+
+
+def test_frames_may_arrive_while_the_panel_reads_them(addon, contract, scene, monkeypatch):
+    """The reader thread adds frames of new views while the main thread reads the frames that are shown."""
+    viewport, live = addon("freeze.viewport"), addon("freeze.live")
+    session, views = live.Session(Path("shot"), "main"), 20000
+    session.facts = {"suggestions": [{"frame": 5, "seen": 1.0, "sharpness": 1.0}]}
+    monkeypatch.setattr(viewport, "_session", session)
+    scene.splannequin.choose_t_star, scene.splannequin.t_star = True, 6
+
+    def receive():
+        for n in range(views):
+            request = contract.LiveView(n, 0, VIEWMAT, [9.0, 9.0, 8.0, 6.0], 1, 1, 6.0)
+            session.ask(request)
+            _answer(session, request)
+
+    reader = threading.Thread(target=receive)
+    reader.start()
+    while reader.is_alive():
+        assert viewport.reason(scene) == "Suggested: 5."
+    reader.join()
+    assert len(session.frames) == views
 
 
 def test_switching_develop_sends_a_new_request(addon, contract):
