@@ -29,7 +29,7 @@ class Frame:
     """A rendered view of the frozen instant."""
 
     request: contract.LiveView
-    """The request."""
+    """The request that this frame answers."""
     t_star: int
     """Frame number at which time stands still: the requested one, or the nearest trained one."""
     rgba: np.ndarray
