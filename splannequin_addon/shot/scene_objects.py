@@ -103,7 +103,7 @@ def drop(scene: bpy.types.Scene, shot: Path) -> None:
 
 
 def part(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | None:
-    """One of `PARTS`, or the plate; None if the scene no longer has it."""
+    """The shot's object called `name` (one of `PARTS`, or "plate"); None if the scene no longer has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
     return item if item is not None and named(scene.objects, item.name) == item else None
