@@ -145,6 +145,16 @@ def test_a_view_that_came_to_rest_is_drawn_once_more_however_late_the_timer_is(a
     assert drawn.count(("WINDOW",)) == 2, "the switch is followed"
 
 
+def test_closed_views_free_their_images(addon, monkeypatch):
+    viewport, session = addon("freeze.viewport"), addon("freeze.live").Session(Path("shot"), "main")
+    region = bpy.context.window_manager.windows[0].screen.areas[0].regions[0].as_pointer()
+    for name in ("_moved", "_shown"):
+        monkeypatch.setattr(viewport, name, {region: 0.0, 1: 0.0})
+    session.frames.update({region: None, 1: None})
+    viewport._forget_closed_views(session)
+    assert viewport._moved.keys() == viewport._shown.keys() == session.frames.keys() == {region}
+
+
 def test_what_the_backend_warned_of_is_shown_while_it_draws(addon, shot, monkeypatch):
     viewport = addon("freeze.viewport")
     assert viewport.note() == ""
