@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -33,12 +32,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from benchmarks.detail import develop_argument
 from benchmarks.detail_clip import DetailClip
 from benchmarks.detail_figures import dilate
 from benchmarks.detail_truth import scene_arguments, trained_scenes
+from benchmarks.report.metrics import known_mean
+from benchmarks.report.setting import plain
 from benchmarks.report.truth import PANES
 from benchmarks.sources import SyntheticTruth, in_words
-from torch_backend.contract import SWITCH
 from torch_backend.shot import write_json
 
 INSIDE = 2
@@ -172,7 +173,7 @@ def judge(
 def _text(of: dict[str, float | None]) -> str:
     def said(name: str, unit: float, digits: int) -> str:
         value = of[name]
-        return "–" if value is None else f"{unit * value:.{digits}f}"
+        return plain(value and unit * value, digits)
 
     cells = said("median", 100.0, 2), said("beyond", 100.0, 1), said("boundary_f", 1.0, 3), said("precision", 1.0, 3)
     shares = said("within_1_sigma", 100.0, 1), said("within_2_sigma", 100.0, 1)
@@ -192,11 +193,9 @@ def table(found: dict[str, dict[str, dict[str, float | None]]]) -> list[str]:
 
 def mean_of(found: Sequence[dict[str, dict[str, float | None]]]) -> dict[str, dict[str, float | None]]:
     """Mean of the figures of several trainings."""
-    mean: dict[str, dict[str, float | None]] = {}
-    for region, of in found[0].items():
-        known = {name: [v for f in found if (v := f[region][name]) is not None] for name in of}
-        mean[region] = {name: statistics.fmean(values) if values else None for name, values in known.items()}
-    return mean
+    return {
+        region: {name: known_mean(f[region][name] for f in found) for name in of} for region, of in found[0].items()
+    }
 
 
 @in_words
@@ -205,12 +204,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="training seeds")
-    parser.add_argument(
-        "--develop",
-        default="on",
-        choices=SWITCH,
-        help="off: use the Gaussians as the run trained them, without fine-tuning per instant",
-    )
+    develop_argument(parser)
     args = parser.parse_args(argv)
     found: dict[str, dict[str, dict[str, float | None]]] = {}
     for truth, runs in trained_scenes(args, args.seeds):

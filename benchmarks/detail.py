@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,8 @@ from torch import Tensor
 
 from benchmarks.detail_clip import VARIANTS, DetailClip, open_clip, over
 from benchmarks.detail_figures import mean_difference, picture_figures
+from benchmarks.report.metrics import known_mean
+from benchmarks.report.setting import plain
 from benchmarks.sources import in_words
 from torch_backend.contract import SWITCH
 from torch_backend.footage.images import write_png
@@ -93,18 +94,13 @@ def judge(
     for path in strips.glob("t[0-9]*_[0-9]*.png") if strips else ():
         if path not in written:
             path.unlink()
-    result["instants_differ_255"] = statistics.fmean(differences) if differences else None
+    result["instants_differ_255"] = known_mean(differences)
     return result
 
 
 def means(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """{variant: {figure: mean over the frames that have it}}."""
-    return {v: {name: _mean(row[v][name] for row in rows) for name in FIGURES} for v in VARIANTS if v in rows[0]}
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return statistics.fmean(known) if known else None
+    return {v: {name: known_mean(row[v][name] for row in rows) for name in FIGURES} for v in VARIANTS if v in rows[0]}
 
 
 def _line_of(row: Row) -> str:
@@ -119,14 +115,13 @@ def table(name: str, result: dict[str, Any]) -> list[str]:
     ]
     for freeze in result["freezes"]:
         for variant, of in freeze["mean"].items():
-            values = [of[figure] for figure in FIGURES]
-            cells = ["–" if v is None else f"{v:.2f}" for v in values]
+            cells = [plain(of[figure]) for figure in FIGURES]
             lines.append(f"| t* {freeze['t_star']}, {variant} | " + " | ".join(cells) + " |")
     both = [[row for freeze in result["freezes"] for row in freeze["frames"]]]
     for variant, of in means(both[0]).items() if len(result["freezes"]) > 1 else ():
-        cells = ["–" if v is None else f"{v:.2f}" for v in of.values()]
+        cells = [plain(v) for v in of.values()]
         lines.append(f"| both, {variant} | " + " | ".join(cells) + " |")
-    share = _mean(row["still_share"] for row in both[0])
+    share = known_mean(row["still_share"] for row in both[0])
     lines += ["", f"Still: {100 * (share or 0):.0f} % of the pixels, by {result['motion_from']}."]
     if result["instants_differ_255"] is not None:
         lines[-1] += (

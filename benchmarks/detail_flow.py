@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-import statistics
 import sys
 import time
 from collections.abc import Sequence
@@ -47,6 +46,8 @@ from benchmarks.detail_figures import (
     unexplained_flow,
     unsteadiness,
 )
+from benchmarks.report.metrics import known_mean
+from benchmarks.report.setting import plain
 from benchmarks.sources import in_words
 from torch_backend.shot import write_json
 
@@ -167,13 +168,9 @@ def judge_flow(clip: DetailClip, t_star: int, pairs: Sequence[tuple[int, int]]) 
         a = last if last is not None and last.frame == first else show(clip, first, t_star)
         last = show(clip, second, t_star)
         rows.append(judge_pair(flow, clip, a, last, sums))
-        figures = ", ".join(f"{w} {_px(rows[-1][w]['moving'])} / {_px(rows[-1][w]['still'])}" for w in WHAT)
+        figures = ", ".join(f"{w} {plain(rows[-1][w]['moving'])} / {plain(rows[-1][w]['still'])}" for w in WHAT)
         print(f"[{n + 1}/{len(pairs)}] t* {t_star}, frames {first}, {second}: {figures} px moving / still", flush=True)
     return {"t_star": t_star, "clip": {what: total.figures() for what, total in sums.items()}, "frames": rows}
-
-
-def _px(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
 
 
 def worst_frames(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
@@ -213,11 +210,11 @@ def table(name: str, freezes: Sequence[dict[str, Any]]) -> list[str]:
     for freeze in freezes:
         for what in WHAT:
             of, more = freeze["clip"][what], excesses(freeze, what)
-            cells = [_px(v) for v in (of["moving"]["p99_px"], of["still"]["p99_px"], of["excess_px"])]
-            cells += [_px(statistics.fmean(more) if more else None), f"{sum(v > ALLOWED for v in more)} of {len(more)}"]
+            cells = [plain(v) for v in (of["moving"]["p99_px"], of["still"]["p99_px"], of["excess_px"])]
+            cells += [plain(known_mean(more)), f"{sum(v > ALLOWED for v in more)} of {len(more)}"]
             cells += [
-                _px(max(more, default=None)),
-                *(_px(of[region]["unsteady_255"]) for region in ("moving", "still")),
+                plain(max(more, default=None)),
+                *(plain(of[region]["unsteady_255"]) for region in ("moving", "still")),
             ]
             lines.append(f"| t* {freeze['t_star']}, {what} | " + " | ".join(cells) + " |")
     return lines

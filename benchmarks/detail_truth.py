@@ -26,13 +26,14 @@ import torch
 from torch import Tensor
 
 from benchmarks.bench import RunSpec, hold_out_phase, train_spec
+from benchmarks.detail import develop_argument
 from benchmarks.detail_clip import DetailClip, over
 from benchmarks.report.metrics import WHOLE, score
 from benchmarks.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
+from benchmarks.report.setting import plain
 from benchmarks.report.things import overall, recall_of
 from benchmarks.report.truth import HELD, REGIONS, TruthScene
 from benchmarks.sources import SyntheticTruth, in_words, load_synthetic
-from torch_backend.contract import SWITCH
 from torch_backend.shot import write_json
 from torch_backend.train import load_run
 
@@ -153,16 +154,12 @@ def recalls(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, tuple[float |
 def recall_table(found: dict[str, dict[str, dict[str, tuple[float | None, float | None]]]]) -> list[str]:
     """Recall by scene and thing in Markdown; [] without a small mover."""
     lines = [
-        f"| {scene} | {name} | {' -> '.join(' / '.join(_share(s) for s in of[v]) for v in VARIANTS)} |"
+        f"| {scene} | {name} | {' -> '.join(' / '.join(plain(s, 3) for s in of[v]) for v in VARIANTS)} |"
         for scene, objects in found.items()
         for name, of in objects.items()
     ]
     head = ["", "| scene | object | recall: all poses / worst pose |", "|---|---|---|"]
     return [*head, *lines] if lines else []
-
-
-def _share(share: float | None) -> str:
-    return "–" if share is None else f"{share:.3f}"
 
 
 def scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -184,12 +181,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
     parser.add_argument("--seed", type=int, default=0, help="training seed")
-    parser.add_argument(
-        "--develop",
-        default="on",
-        choices=SWITCH,
-        help="off: use the Gaussians as the run trained them, without fine-tuning per instant",
-    )
+    develop_argument(parser)
     parser.add_argument("--delivered", action="store_true", help="judge at the resolution of the plates")
     parser.add_argument("--train-only", action="store_true")
     args = parser.parse_args(argv)

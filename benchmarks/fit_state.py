@@ -31,7 +31,7 @@ from benchmarks.detail_truth import scene_arguments, trained_scenes
 from benchmarks.report.metrics import psnr_of
 from benchmarks.report.truth import TruthScene
 from benchmarks.sources import in_words
-from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go
+from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, rejection
 from torch_backend.freeze.frozen import OutputFrame
 from torch_backend.freeze.views.reproject import blurred, resized
 from torch_backend.freeze.views.target_view import target_view
@@ -144,7 +144,7 @@ def judged(case: Case, weights: StateWeights) -> dict[str, float]:
     config = StateConfig(weights=weights)
     values = torch.tensor([getattr(weights, name) for name in NAMES])
     odds = case.evidence @ values + weights.bias
-    share = torch.stack([let_go(blurred(each, config.smoothing * case.unit), config) for each in odds])[..., None]
+    share = torch.stack([rejection(blurred(each, config.smoothing * case.unit), config) for each in odds])[..., None]
     mixed = torch.lerp(case.plate, case.filled, share)
     found = {"let go": float(share.mean())}
     for name, picture in {"mixed": mixed, "plate": case.plate, "fill": case.filled}.items():

@@ -6,7 +6,7 @@ Stages, of at most 8 minutes each; docs/gpu.md explains their figures:
   raster       W2, W3 and W4 against gsplat in one run, a profile of a step, the cost of a hit list that is too short,
                the cost of a field's planes
   training     a solved shot (--shot) on both devices, two seeds: PSNR, ms per step, waits of the host
-  limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, views per second
+  limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, composited frames, views per second
 
 Each stage writes DIR/gpu-STAGE.json. A failed part, or one without enough time left, is reported in that file, and the
 other parts continue. `--only PART ...` selects parts of a stage. `--dry-run` runs the same code on the CPU at tiny
@@ -20,6 +20,7 @@ import json
 import math
 import os
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -42,13 +43,16 @@ from benchmarks.workload import WORKLOADS, room
 from torch_backend.cli import card_facts
 from torch_backend.contract import METRICS_FILE, CameraPath, FreezeParams, JobError, LiveView, TrainParams, program
 from torch_backend.deformation import HexPlane, HexPlaneConfig, planes_cuda
+from torch_backend.footage.plates import Plates
 from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.composite.compositor import CompositeFrame, Compositor
+from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen, span_of
 from torch_backend.live import LiveSession
 from torch_backend.native import default_threads
 from torch_backend.raster import hit_lists
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot, write_json
-from torch_backend.train import PRESETS, config_from_params, train_shot
+from torch_backend.train import PRESETS, config_from_params, load_run, train_shot
 from torch_backend.train.device import cuda_refusal
 from torch_backend.train.events import schedule_events
 from torch_backend.train.loop import train_to_end
@@ -534,6 +538,7 @@ def limits(stage: Stage) -> None:
         stage.part(f"memory_{gb}", lambda gb=gb: _memory(stage, gb), needs=40.0)
     stage.part("resume", lambda: _resumed(stage), needs=30.0)
     stage.part("freeze", lambda: _frozen(stage), needs=60.0)
+    stage.part("composite", lambda: _composited(stage), needs=60.0)
     stage.part("live", lambda: _live(stage), needs=20.0)
 
 
@@ -614,6 +619,30 @@ def _frozen(stage: Stage) -> dict[str, Any]:
     params.develop = "off" if stage.dry else params.develop
     facts = freeze_shot(shot, params, Warnings())
     return {"frames": facts["frames"], "seconds_per_frame": round((time.perf_counter() - since) / facts["frames"], 3)}
+
+
+def _composited(stage: Stage) -> dict[str, Any]:
+    """Frames composited from plates at 1080p: seconds each, reading the plates included, and error between devices."""
+    shot, name = stage.scratch_shot(), _run_of(stage)
+    scene, size = load_scene(shot), (64, 48) if stage.dry else (1920, 1080)
+    plates, Ks, frames = Plates(shot, size), scene.camera_at(*size), range(0, len(scene.frames), 3)
+    last: list[CompositeFrame] = []
+    row: dict[str, Any] = {}
+    for device, count in ((stage.device.type, 3 if stage.dry else 24), ("cpu", 3)):
+        run = load_run(shot, name, torch.device(device))
+        t_star, compositor, spent = run.train_frames[0], Compositor(run, scene, plates), list[float]()
+        frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run))
+        for i in [*frames[:count][::-1], frames[0]]:  # the last frame is the same on both devices
+            since, frame = time.perf_counter(), scene.frames[i]
+            output = OutputFrame(frame, scene.viewmats[i], Ks[i], float(t_star), float(frame))
+            exposed_at = scene.time_of_frame(frame)
+            image = render_frozen(frozen, output.viewmat, output.K, *size, run.model.exposure, exposed_at)
+            composite = compositor.frame(output, frozen, image, *size, (frame,)).cpu()
+            spent.append(time.perf_counter() - since)
+        last.append(composite)
+        row[f"{device}_s"] = [round(value, 4) for value in (statistics.median(spent), min(spent), max(spent))]
+    row["error"] = float((last[0].linear - last[-1].linear).abs().max())
+    return row
 
 
 def _live(stage: Stage) -> dict[str, Any]:

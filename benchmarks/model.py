@@ -20,7 +20,6 @@ import dataclasses
 import functools
 import json
 import os
-import statistics
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -34,7 +33,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from benchmarks.detail_figures import induced_places, inside, sampled, still_pixels
-from benchmarks.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
+from benchmarks.report.metrics import best_share_psnr, gradient_magnitude, known_mean, psnr_of
 from benchmarks.sources import in_words
 from benchmarks.training_step import _Silent
 from torch_backend.contract import TrainParams
@@ -127,7 +126,7 @@ class Judge:
         """A frozen scene rendered from a frame's camera."""
         t, at = self.trainer, float(self.scene.times[index])
         view = t.viewmats[index], self.Ks[index]
-        return render_frozen(frozen, *view, self.width, self.height, t.model.exposure, at)
+        return render_frozen(frozen, *view, self.width, self.height, t.model.exposure, at).cpu()
 
     def frozen(self, frozen: FrozenGaussians, t_star: int) -> list[dict[str, Any]]:
         """`OF_FROZEN` at the instant of frame index `t_star`, one row per held-out frame that is far enough away."""
@@ -172,8 +171,7 @@ def _psnr(image: Tensor, plate: Tensor, where: Tensor) -> float | None:
 
 def mean(rows: Sequence[dict[str, Any]], name: str) -> float | None:
     """Mean of a figure over the rows where it is not None."""
-    values = [row[name] for row in rows if row.get(name) is not None]
-    return statistics.fmean(values) if values else None
+    return known_mean(row.get(name) for row in rows)
 
 
 def nearest_trained(trainer: Trainer, frame: int) -> int:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -129,11 +129,18 @@ def run_child(
     if log is not None:
         streams.update(stdout=log, stderr=subprocess.STDOUT)
     child = start_child(command, child_environ(**environ), **streams)
-    try:
+    with _cancelled_by_ctrl_c(child):
         while True:
             # On Windows, Ctrl-C cannot interrupt a wait without timeout.
             with contextlib.suppress(subprocess.TimeoutExpired):
                 return exit_code_of(child.wait(0.2))
+
+
+@contextlib.contextmanager
+def _cancelled_by_ctrl_c(child: subprocess.Popen[Any]) -> Generator[None]:
+    """Ctrl-C in the block cancels the child, then raises KeyboardInterrupt. Closes the child's input at the end."""
+    try:
+        yield
     except KeyboardInterrupt:
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
@@ -142,8 +149,8 @@ def run_child(
         close_input(child)
 
 
-def _lines_of(child: subprocess.Popen[bytes]) -> Iterator[bytes]:
-    """Yields the lines that a child prints, as they arrive.
+def lines_of(child: subprocess.Popen[bytes]) -> Iterator[str | None]:
+    """Yields the lines that a child prints, as they arrive, and None while it is silent.
 
     A thread reads them, also after Ctrl-C. On Windows a read cannot be interrupted, and a child whose output is not
     read blocks at its next print instead of ending.
@@ -157,11 +164,14 @@ def _lines_of(child: subprocess.Popen[bytes]) -> Iterator[bytes]:
 
     threading.Thread(target=read, name="child's output", daemon=True).start()
     while True:
-        with contextlib.suppress(queue.Empty):
+        try:
             line = lines.get(timeout=0.2)
-            if line is None:
-                return
-            yield line
+        except queue.Empty:
+            yield None
+            continue
+        if line is None:
+            return
+        yield line.decode("utf-8", "replace")
 
 
 def exit_code_of(code: int) -> int:
@@ -184,19 +194,14 @@ def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
     """`run_child(tied=True)` for Blender. All output goes to `log`; the add-on's lines also go to the screen."""
     streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     child = start_child(command, child_environ(**environ), **streams)
-    try:
-        with open(log, "w", encoding="utf-8") as stream:
-            for raw in _lines_of(child):
-                line = raw.decode("utf-8", "replace").rstrip()
-                stream.write(line + "\n")
-                if line.startswith("Error: "):
-                    print(line, file=sys.stderr, flush=True)
-                elif not BLENDER_LOG_LINE.match(line):
-                    say(line)
+    with _cancelled_by_ctrl_c(child), open(log, "w", encoding="utf-8") as stream:
+        for printed in lines_of(child):
+            if printed is None:
+                continue
+            line = printed.rstrip()
+            stream.write(line + "\n")
+            if line.startswith("Error: "):
+                print(line, file=sys.stderr, flush=True)
+            elif not BLENDER_LOG_LINE.match(line):
+                say(line)
         return exit_code_of(child.wait())
-    except KeyboardInterrupt:
-        say("\nCancelling; Ctrl-C again stops at once.")
-        stop_child(child)
-        raise KeyboardInterrupt("the child has said so") from None
-    finally:
-        close_input(child)

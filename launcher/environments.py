@@ -6,12 +6,10 @@ import functools
 import hashlib
 import os
 import platform
-import queue
 import re
 import shutil
 import subprocess
 import sys
-import threading
 import time
 import urllib.error
 import urllib.parse
@@ -40,7 +38,7 @@ from torch_backend.contract import (
 )
 from torch_backend.shot import is_disk_full, locked, write_json
 
-from .children import child_environ, close_input, say, start_child, stop_child, tied_command
+from .children import child_environ, close_input, lines_of, say, start_child, stop_child, tied_command
 from .errors import LauncherError
 from .interpreters import NEEDED_PYTHON, python_version
 from .pip_output import condense_pip, refuse
@@ -340,33 +338,20 @@ def _step(
 ) -> None:
     """Runs one step of a set-up. Its output goes to the log; `condense` selects and shortens lines for the screen."""
     started = time.monotonic()
-    lines: queue.Queue[str | None] = queue.Queue()
     child = start_child(
         command, child_environ(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     )
-
-    def read() -> None:
-        assert child.stdout is not None  # started with PIPE
-        for raw in child.stdout:
-            lines.put(raw.decode("utf-8", "replace"))
-        lines.put(None)
-
-    threading.Thread(target=read, daemon=True).start()
     output_lines: list[str] = []
     spoke = started
     try:
         with open(environment.log, "a", encoding="utf-8") as log:
             log.write(f"$ {subprocess.list2cmdline(command)}\n")
-            while True:
-                try:
-                    line = lines.get(timeout=0.5)
-                except queue.Empty:
+            for line in lines_of(child):
+                if line is None:
                     if time.monotonic() - spoke > HEARTBEAT_SECONDS:
                         spoke = time.monotonic()
                         say(f"  {spoke - started:5.0f} s  still {step}")
                     continue
-                if line is None:
-                    break
                 log.write(line)
                 output_lines.append(line.strip())
                 text = condense(line.strip()) if condense else None

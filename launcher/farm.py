@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from torch_backend.contract import ExitCode
 
-from .blender import get_blender
+from .blender import get_blender, program_at
 from .children import child_environ, run_child, tied_command
 from .environments import backend_environment, set_up
 from .errors import LauncherError
@@ -44,8 +44,7 @@ def host(words: Sequence[str]) -> int:
                 raise LauncherError(f"There is no {path} on this host: correct the job's parameter {what}.")
         command: list[str] = []
         if args.blender:
-            options = ("--background", "--factory-startup", "--python-exit-code", str(int(ExitCode.BAKE)), "--python")
-            command = [args.blender, *options]
+            command = [*program_at(args.blender, "").command]
         elif args.bake:
             blender, _ = get_blender()
             command = [*blender.command, *(["-P"] if blender.is_wheel else [])]

@@ -177,6 +177,7 @@ class LiveSession:
         image = render_frozen(frozen, output.viewmat, output.K, view.width, view.height, exposure, exposed_at)
         if view.detail and view.show == "color":
             image = self._details.frame(output, frozen, image, stop)
+        image = image.cpu()
         alpha = image.alpha[..., None]
         if view.show == "color":
             shown = image.color

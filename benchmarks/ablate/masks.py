@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +15,10 @@ from benchmarks.ablate.switches import COMBINATIONS, RULES, STATE, of_frames, re
 from benchmarks.ablate.table import Store
 from benchmarks.other_state.masks import CLIPS, Painted, Pair, load_masks, plate_labels
 from benchmarks.other_state.scores import LET_GO, count
+from benchmarks.report.metrics import known_mean
 from torch_backend.lens.plate_lens import load_plate_lenses
+
+RATIOS = ("iou", "extra_share")
 
 
 def variants() -> dict[str, frozenset[str]]:
@@ -53,15 +55,11 @@ def _judged(
         labels = plate_labels(masks.labels(pair), where)
         for name, disabled in todo.items():
             composite, decided, _ = maker.make(pair.frame, disabled)
-            let_go = (composite.matte < LET_GO) | (composite.primary != pair.frame)
-            counts = count(let_go.numpy(), labels)
-            ratios = {"iou": counts.iou, "extra_share": counts.extra_share}
+            rejected = (composite.matte < LET_GO) | (composite.primary != pair.frame)
+            counts = count(rejected.numpy(), labels)
+            ratios = {key: getattr(counts, key) for key in RATIOS}
             rows[name].append({"frame": pair.frame, "decision_s": decided, **ratios, **asdict(counts)})
-    means = {name: {ratio: _mean(found, ratio) for ratio in ("iou", "extra_share")} for name, found in rows.items()}
-    return {name: {"frames": found, "seconds": {}, **means[name]} for name, found in rows.items()}
-
-
-def _mean(frames: list[Row], ratio: str) -> float | None:
-    """Mean of a ratio over the frames where it is not None; None without such a frame."""
-    known = [frame[ratio] for frame in frames if frame[ratio] is not None]
-    return statistics.fmean(known) if known else None
+    return {
+        name: {"frames": found, "seconds": {}, **{key: known_mean(of[key] for of in found) for key in RATIOS}}
+        for name, found in rows.items()
+    }

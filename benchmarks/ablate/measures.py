@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -16,7 +15,7 @@ from benchmarks.ablate.switches import RULES, detail_config, replaced, rules_dis
 from benchmarks.detail_clip import DetailClip, View, over
 from benchmarks.detail_figures import Flow, textured, unexplained_flow, unsteadiness
 from benchmarks.detail_flow import LEAST, Pair, Shown, lay_over
-from benchmarks.report.metrics import psnr_by_region, psnr_of
+from benchmarks.report.metrics import known_mean, psnr_by_region, psnr_of
 from benchmarks.report.things import recall_of
 from benchmarks.report.truth import TruthScene
 from torch_backend.freeze.composite.compositor import CompositeFrame, Compositor
@@ -186,19 +185,14 @@ def summary(row: Row) -> dict[str, float | None]:
     frames, found = row["frames"], dict[str, float | None]()
     for what in ("delivered", "developed"):
         for region in ("whole", "never_seen", "moving", "static"):
-            found[f"{what} {region}"] = _mean([f[what].get(region) for f in frames if what in f])
+            found[f"{what} {region}"] = known_mean(f[what].get(region) for f in frames if what in f)
     counts = [count for f in frames for count in f.get("recalled", {}).values()]
     should = sum(count[1] for count in counts)
     found["recall"] = sum(count[0] for count in counts) / should if should else None
-    errors = [f["still_mse"] for f in frames if f.get("still_mse") is not None]
-    found["still"] = psnr_of(statistics.fmean(errors)) if errors else None
+    error = known_mean(f.get("still_mse") for f in frames)
+    found["still"] = None if error is None else psnr_of(error)
     for name in ("flicker", "moving_p50", "moving_p99", "still_p50", "still_p99", "decision_s", "frame_s", "own"):
-        found[name] = _mean([f.get(name) for f in frames])
+        found[name] = known_mean(f.get(name) for f in frames)
     moving, rest = found["moving_p99"], found["still_p99"]
     found["excess"] = None if moving is None or rest is None else moving - rest
     return found
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return statistics.fmean(known) if known else None

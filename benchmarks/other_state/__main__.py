@@ -25,6 +25,7 @@ import torch
 
 from benchmarks.detail import develop_argument, name_of, save_strip
 from benchmarks.detail_clip import DetailClip, View, open_clip
+from benchmarks.report.setting import plain
 from benchmarks.sources import in_words
 from torch_backend.shot import write_json
 
@@ -70,7 +71,7 @@ def table(name: str, rows: Sequence[Row], summed: dict[str, Any]) -> list[str]:
 
 
 def _cells(figures: dict[str, float | None]) -> str:
-    return " | ".join("–" if (v := figures[name]) is None else f"{v:.3f}" for name in FIGURES)
+    return " | ".join(plain(figures[name], 3) for name in FIGURES)
 
 
 def picture(clip: DetailClip, row: Row, view: View, labels: Labels) -> list[torch.Tensor]:

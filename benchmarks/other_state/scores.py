@@ -13,6 +13,7 @@ from torch import Tensor
 
 from benchmarks.detail_clip import DetailClip, View, over
 from benchmarks.detail_figures import MOVER_MATTE
+from benchmarks.report.metrics import known_mean
 from torch_backend.lens.plate_lens import load_plate_lenses
 
 from .masks import CHANGED, SAME, Labels, Painted, plate_labels
@@ -101,11 +102,8 @@ def pooled_counts(counts: Iterable[Counts]) -> Counts:
 
 def mean_counts(counts: Sequence[Counts]) -> dict[str, float | None]:
     """{figure: mean over the frames where it is not None}; frames weigh equally."""
-    means: dict[str, float | None] = {}
-    for name in ("iou", "precision", "recall", "extra_share"):
-        values = [value for c in counts if (value := getattr(c, name)) is not None]
-        means[name] = float(np.mean(values)) if values else None
-    return means
+    names = ("iou", "precision", "recall", "extra_share")
+    return {name: known_mean(getattr(c, name) for c in counts) for name in names}
 
 
 def score(clip: DetailClip, masks: Painted) -> list[Row]:
@@ -129,8 +127,8 @@ def judged(clip: DetailClip, masks: Painted) -> Iterable[tuple[Row, View, Labels
         where = lenses[pair.frame].where(clip.width, clip.height) if lenses else straight
         labels = plate_labels(masks.labels(pair), where * scale)
         counts = {
-            name: count(let_go.numpy(), labels)
-            for name, let_go in zip(METHODS, _let_go(clip, pair.t_star, pair.frame, view), strict=True)
+            name: count(rejected.numpy(), labels)
+            for name, rejected in zip(METHODS, _let_go(clip, pair.t_star, pair.frame, view), strict=True)
         }
         yield Row(pair.t_star, pair.frame, counts), view, labels
 

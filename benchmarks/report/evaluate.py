@@ -62,11 +62,11 @@ class Frozen:
             withheld = (pose,) if shown == WITHHELD else ()
             composite = self.compositor.frame(output, gaussians, image, self.run.width, self.run.height, withheld)
             color, alpha = composite.color, composite.alpha
-        return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0)
+        return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0).cpu()
 
     def motion(self, pose: int) -> Tensor:
         """[H, W] in [0, 1] from the pose of frame `pose`: share of each pixel that the model moves in the clip."""
-        return self._splats(pose, self.gaussians).motion
+        return self._splats(pose, self.gaussians).motion.cpu()
 
     def _camera(self, pose: int) -> tuple[Tensor, Tensor]:
         index = self.scene.frames.index(pose)

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from .metrics import known_mean
 from .records import SPLATS, FrameScore, RunRecord
-from .setting import NONE, Setting
+from .setting import NONE, Setting, plain
 from .things import LEAST_PIXELS, RECALL_CONTRAST, RECALL_DISTANCE, overall
 from .truth import PANES
 
@@ -76,7 +77,7 @@ def _counts(runs: Sequence[RunRecord], name: str) -> list[tuple[int, int]]:
 
 def _recall(counts: Sequence[tuple[int, int]]) -> list[str]:
     """Recall over all frames, and in the worst frame of those with enough pixels."""
-    return [NONE if share is None else f"{share:.2f}" for share in overall(counts)]
+    return [plain(share) for share in overall(counts)]
 
 
 def _decibels(setting: Setting, region: str) -> str:
@@ -94,8 +95,7 @@ def _difference(wall: float | None, pane: float | None) -> float | None:
 
 
 def _mean(setting: Setting, read: Callable[[FrameScore], float | None]) -> float | None:
-    values = [v for run in setting.runs for row in run.rows if (v := read(row)) is not None]
-    return float(np.mean(values)) if values else None
+    return known_mean(read(row) for run in setting.runs for row in run.rows)
 
 
 def _of_matte(runs: Sequence[RunRecord], pane: str) -> str:

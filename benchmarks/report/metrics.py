@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -181,6 +181,12 @@ class Summary:
     bottom_25: float
     worst: float
     """Value of the worst frame."""
+
+
+def known_mean(values: Iterable[float | None]) -> float | None:
+    """Mean of the values that are not None; None without such values."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def summarise(values: Sequence[float | None], more_is_better: bool = True) -> Summary | None:

@@ -7,11 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .metrics import METRICS, WHOLE, Key, Paired, Summary, paired, summarise
+from .metrics import METRICS, WHOLE, Key, Paired, Summary, known_mean, paired, summarise
 from .records import FrameScore, RunRecord
 
 NONE = "–"
 """Text of an empty table cell."""
+
+
+def plain(value: float | None, digits: int = 2) -> str:
+    """A formatted number, or a dash for None."""
+    return NONE if value is None else f"{value:.{digits}f}"
 
 
 @dataclass
@@ -44,13 +49,11 @@ class Setting:
 
     def jod(self) -> float | None:
         """Mean ColorVideoVDP over the instants of all runs; None without any."""
-        values = [v for run in self.runs for v in run.jod.values() if v is not None]
-        return float(np.mean(values)) if values else None
+        return known_mean(v for run in self.runs for v in run.jod.values())
 
     def of_heldout(self, region: str) -> float | None:
         """Mean PSNR in dB over a region of the clip's held-out frames of all runs; None if no frame has the region."""
-        values = [v for run in self.runs for v in run.heldout_values(region).values() if v is not None]
-        return float(np.mean(values)) if values else None
+        return known_mean(v for run in self.runs for v in run.heldout_values(region).values())
 
     def against(self, reference: Setting, metric: str, region: str = WHOLE) -> Paired | None:
         """Comparison with another setting, frame by frame, or for `jod` instant by instant."""

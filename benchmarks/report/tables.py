@@ -9,7 +9,7 @@ from typing import Any
 from .hard_table import MOVER_HEADER, MOVER_NOTE, PANE_HEADER, PANE_NOTE, mover_rows, pane_rows
 from .metrics import WHOLE, Paired
 from .records import DELIVERED, DEVELOPED, SPLATS, WITHHELD, RunRecord
-from .setting import NONE, Setting
+from .setting import NONE, Setting, plain
 from .truth import REGIONS, RIGID
 
 HOST_NAMES = {
@@ -369,11 +369,6 @@ def _real_extra(settings: Sequence[Setting]) -> Table:
 def number(value: float | None, metric: str) -> str:
     """A figure formatted with the digits of its metric."""
     return plain(value, _DIGITS[metric])
-
-
-def plain(value: float | None, digits: int) -> str:
-    """A formatted number, or a dash for None."""
-    return NONE if value is None else f"{value:.{digits}f}"
 
 
 def pace(run: RunRecord) -> str:

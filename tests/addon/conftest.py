@@ -81,7 +81,9 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def pictures() -> types.SimpleNamespace:
-    return types.SimpleNamespace(write=write_png, read=lambda path: pixels.read(path)[..., :3], srgb=srgb)
+    return types.SimpleNamespace(
+        write=write_png, png=make_shot.png, read=lambda path: pixels.read(path)[..., :3], srgb=srgb
+    )
 
 
 @pytest.fixture
@@ -100,6 +102,13 @@ def run(addon, capfd):
 @pytest.fixture
 def shot(tmp_path: Path) -> Path:
     return make_shot.make_shot(tmp_path)
+
+
+@pytest.fixture
+def with_shot(scene, shot: Path):
+    """The scene with `shot` as its shot folder."""
+    scene.splannequin.shot_path = str(shot)
+    return scene
 
 
 @pytest.fixture(scope="session")

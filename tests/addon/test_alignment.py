@@ -102,16 +102,6 @@ def test_selected_objects_serve_as_points(addon, built, shot):
         bpy.ops.splannequin.align_scale(selected=True)
 
 
-def test_alignment_is_one_undo_step(addon, built, shot):
-    place = world(addon, built, shot)[3]
-    stood = np.array(addon("solve.cameras").find(built, shot, "EMPTY").matrix_world)
-    bpy.ops.ed.undo_push(message="before")
-    assert bpy.ops.splannequin.align_origin("EXEC_DEFAULT", True, places=place) == {"FINISHED"}
-    bpy.ops.ed.undo()
-    root = addon("solve.cameras").find(bpy.context.scene, shot, "EMPTY")
-    np.testing.assert_allclose(root.matrix_world, stood, atol=1e-6)
-
-
 def test_collinear_points_do_not_change_the_root(addon, built, shot):
     stood = np.array(addon("solve.cameras").find(built, shot, "EMPTY").matrix_world)
     with pytest.raises(RuntimeError, match="one line"):

@@ -9,6 +9,8 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
+from tests.addon.data.pixels import glow
+
 
 def project(viewmat: np.ndarray, k: list[float], points: np.ndarray) -> np.ndarray:
     """Pixels [P, 2] of world points [P, 3], OpenCV pinhole, pixel centres at +0.5."""
@@ -19,41 +21,6 @@ def project(viewmat: np.ndarray, k: list[float], points: np.ndarray) -> np.ndarr
 def poses_of(shot: Path) -> tuple[list[dict], int, int]:
     path = json.loads((shot / "solve" / "cameras.json").read_text())
     return path["frames"], path["width"], path["height"]
-
-
-def test_identity_camera_looks_along_z_with_y_down(addon):
-    matrix = addon("scene.axes").camera_to_world(np.eye(4))
-    # Blender's camera looks along -z with y up: +z and -y in OpenCV's world.
-    np.testing.assert_allclose(matrix @ [0, 0, -1, 0], [0, 0, 1, 0])
-    np.testing.assert_allclose(matrix @ [0, 1, 0, 0], [0, -1, 0, 0])
-    np.testing.assert_allclose(matrix @ [1, 0, 0, 0], [1, 0, 0, 0])
-
-
-def test_root_translation_is_inverted_for_the_camera(addon):
-    viewmat = np.eye(4)
-    viewmat[:3, 3] = (1, 2, 3)
-    np.testing.assert_allclose(addon("scene.axes").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
-
-
-def test_blenders_axes_are_y_up_and_z_back(addon):
-    addon("solve.cameras")
-    turn = np.array([[0, 0, 1, 0.4], [1, 0, 0, -2.0], [0, 1, 0, 7.0], [0, 0, 0, 1]], dtype=np.float64)
-    matrix = addon("scene.axes").camera_to_world(turn)
-    np.testing.assert_allclose(np.linalg.inv(matrix @ np.diag([1.0, -1.0, -1.0, 1.0])), turn, atol=1e-12)
-
-
-def test_lens_of_a_centred_and_a_shifted_principal_point(addon):
-    addon("solve.cameras")
-    assert addon("scene.axes").lens_from_k((640, 640, 320, 240), 640, 480) == (36.0, 0.0, 0.0)
-    lens, shift_x, shift_y = addon("scene.axes").lens_from_k((1280, 1280, 330, 220), 640, 480)
-    assert (lens, shift_x, shift_y) == (72.0, -10 / 640, -20 / 640)
-
-
-@pytest.mark.parametrize(
-    ("k", "aspect"), [((500, 500, 0, 0), (1, 1)), ((500, 400, 0, 0), (1, 1.25)), ((400, 500, 0, 0), (1.25, 1))]
-)
-def test_pixel_aspect_stays_above_one(addon, k, aspect):
-    np.testing.assert_allclose(addon("scene.axes").pixel_aspect(k), aspect)
 
 
 @pytest.mark.parametrize("fy", [20.0, 16.0, 25.0])
@@ -234,16 +201,6 @@ def test_a_lens_that_no_longer_changes_leaves_no_action(addon, scene, shot):
     assert len(bpy.data.actions) == 1 and camera.data.lens == pytest.approx(20 * 36 / 16)
 
 
-def test_remove_leaves_nothing(addon, scene, shot):
-    names = {
-        kind: set(getattr(bpy.data, kind).keys())
-        for kind in ("objects", "cameras", "meshes", "images", "actions", "collections")
-    }
-    addon("solve.cameras").build(scene, shot)
-    assert addon("solve.cameras").remove(scene, shot)
-    assert names == {kind: set(getattr(bpy.data, kind).keys()) for kind in names}
-
-
 def test_scene_is_upright(addon, scene, shot):
     cameras = addon("solve.cameras")
     camera = cameras.build(scene, shot)
@@ -265,12 +222,7 @@ def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_pa
     root = addon("solve.cameras").find(scene, shot, "EMPTY")
     point = np.array([[-0.5, 0.2, 0.3]])
     bpy.ops.mesh.primitive_uv_sphere_add(radius=0.05, location=root.matrix_world @ Vector(point[0]))
-    glow = bpy.data.materials.new("glow")
-    glow.use_nodes = True
-    glow.node_tree.nodes.clear()
-    emit, out = glow.node_tree.nodes.new("ShaderNodeEmission"), glow.node_tree.nodes.new("ShaderNodeOutputMaterial")
-    glow.node_tree.links.new(emit.outputs[0], out.inputs[0])
-    bpy.context.object.data.materials.append(glow)
+    bpy.context.object.data.materials.append(glow())
     scene.world = None
     scene.render.engine = "CYCLES"
     scene.cycles.device, scene.cycles.samples, scene.cycles.use_denoising = "CPU", 8, False

@@ -6,6 +6,8 @@ from pathlib import Path
 import bpy
 import pytest
 
+from tests.addon.test_cameras import run_out
+
 
 @pytest.fixture
 def solved(addon, scene, shot):
@@ -29,12 +31,7 @@ def artists_take(addon, contract, solved, shot, new_take):
         camera.matrix_world = solved.camera.matrix_world
         camera.location.x += 0.5
         turns = addon("freeze.own_camera").sample_path(solved, "Mine", shot, 0)
-        while True:
-            try:
-                next(turns)
-            except StopIteration as end:
-                path = end.value
-                break
+        path = run_out(turns)
         take = new_take(shot, "mine")
         file = contract.ShotFolder(shot).camera_path("mine")
         contract.write_json(file, path.to_json())

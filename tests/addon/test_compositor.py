@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from mathutils import Vector
 
-from tests.addon.test_layers import render as float_picture
+from tests.addon.data.pixels import glow
+from tests.addon.data.pixels import render as float_picture
 
 
 @pytest.fixture
@@ -580,13 +581,7 @@ def with_a_wall(addon, scene, tmp_path, pictures, place: tuple[float, float, flo
     scene.cycles.pixel_filter_type = "BOX"
     bpy.ops.mesh.primitive_plane_add(size=400.0)
     wall = bpy.context.object
-    glow = bpy.data.materials.new("glow")
-    glow.use_nodes = True
-    glow.node_tree.nodes.clear()
-    shine, end = (glow.node_tree.nodes.new(f"ShaderNode{kind}") for kind in ("Emission", "OutputMaterial"))
-    shine.inputs["Color"].default_value = (0.0, 1.0, 0.0, 1.0)
-    glow.node_tree.links.new(shine.outputs[0], end.inputs["Surface"])
-    wall.data.materials.append(glow)
+    wall.data.materials.append(glow((0.0, 1.0, 0.0, 1.0)))
     camera = scene.camera.matrix_world
     wall.rotation_mode = "QUATERNION"
     wall.rotation_quaternion = camera.to_quaternion()

@@ -9,12 +9,6 @@ STEPS = ("import", "solve", "train", "freeze", "bake")
 
 
 @pytest.fixture
-def with_shot(scene, shot):
-    scene.splannequin.shot_path = str(shot)
-    return scene
-
-
-@pytest.fixture
 def watch(addon, with_shot, shot):
     return addon("process.job_timer").watch_of(shot)
 

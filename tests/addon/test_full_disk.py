@@ -8,6 +8,8 @@ from pathlib import Path
 import bpy
 import pytest
 
+from tests.addon.data.pixels import set_format
+
 
 @pytest.fixture
 def small_disk(tmp_path: Path):
@@ -104,10 +106,7 @@ def test_the_buttons_render_says_a_full_disk_and_earlier_frames_stay(addon, scen
 
 def test_a_movie_that_does_not_fit_leaves_the_one_before(addon, scene, shot, small_disk, contract):
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")
-    settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):
-        settings.media_type = "VIDEO"
-    settings.file_format = "FFMPEG"
+    set_format(scene, "FFMPEG")
     scene.render.ffmpeg.format, scene.render.ffmpeg.codec = "MKV", "FFV1"
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 480, 360, 100
     scene.frame_start, scene.frame_end = 5, 7

@@ -5,12 +5,6 @@ import pytest
 
 
 @pytest.fixture
-def with_shot(scene, shot):
-    scene.splannequin.shot_path = str(shot)
-    return scene
-
-
-@pytest.fixture
 def scrubbed(addon, with_shot, shot):
     """The scene while its shot is scrubbed, reduced to hiding the points."""
     addon("solve.arrival").load_camera(with_shot, shot)

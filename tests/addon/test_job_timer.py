@@ -11,6 +11,8 @@ from pathlib import Path
 import bpy
 import pytest
 
+from tests.addon.data.pixels import set_format
+
 
 @pytest.fixture
 def supervisor(addon):
@@ -299,10 +301,7 @@ def unwritable_movie(scene, tmp_path):
     """Scene that writes a movie into a folder that cannot be created: Blender calls no handler at the end of its
     render."""
     (tmp_path / "file").write_text("")
-    settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):
-        settings.media_type = "VIDEO"
-    settings.file_format = "FFMPEG"
+    set_format(scene, "FFMPEG")
     scene.render.resolution_x = scene.render.resolution_y = 32
     scene.frame_end = 2
     scene.render.filepath = str(tmp_path / "file" / "inside" / "movie")

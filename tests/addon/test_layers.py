@@ -13,7 +13,7 @@ import pytest
 
 from tests.addon.data import make_detail
 from tests.addon.data import make_frames as frames
-from tests.addon.data.pixels import read, render
+from tests.addon.data.pixels import read, render, set_format
 
 DATA = Path(__file__).resolve().parent / "data"
 SIZE = make_detail.WIDTH, make_detail.HEIGHT
@@ -23,11 +23,7 @@ SIZE = make_detail.WIDTH, make_detail.HEIGHT
 def detailed(scene, shot):
     """The shot with a take `detail` of plate-based frames; the scene has their size."""
     scene.render.resolution_x, scene.render.resolution_y = SIZE
-    folder = shot / "takes" / "detail"
-    shutil.copytree(DATA / "detail", folder, ignore=shutil.ignore_patterns("plate"))
-    facts = {"version": 1, "take": "detail", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 2}
-    facts |= {"width": SIZE[0], "height": SIZE[1], "first": 5, "last": 6, "camera_path": ""}
-    (folder / "take.json").write_text(json.dumps(facts))
+    make_detail.add_take(shot)
     return shot
 
 
@@ -138,43 +134,6 @@ def test_the_warp_is_switched_and_removed_without_a_trace(addon, scene, detailed
     assert addon("bake.insertion").remove(scene)
     assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
     assert {(k.from_socket.path_from_id(), k.to_socket.path_from_id()) for k in graded.links} == links
-
-
-def test_freeze_as_warp_is_undone_and_done_again(addon, scene, detailed, graded, tmp_path):
-    """The rendered picture changes too: the take's frames are half floats, the warped plate is not."""
-    scene.splannequin.shot_path, scene.splannequin.take_name = str(detailed), "detail"
-    assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
-
-    def shown(name):
-        current = bpy.context.scene
-        node = node_of(addon, current)
-        tree = addon("compat").compositor_tree(current)
-        inputs, images = (
-            {s.name: s.default_value for s in node.inputs if s.type == "VALUE"},
-            set(bpy.data.images.keys()),
-        )
-        (tmp_path / name).mkdir()
-        picture = render(current, tmp_path / name)
-        return {
-            "inputs": inputs,
-            "images": images,
-            "nodes": set(node.node_tree.nodes.keys()),
-            "links": len(tree.links),
-        }, picture
-
-    bpy.ops.ed.undo_push(message="before")
-    before, frames_shown = shown("before")
-    assert bpy.ops.splannequin.freeze_as_warp() == {"FINISHED"}
-    bpy.ops.ed.undo_push(message="after")
-    after, warped = shown("after")
-    assert "As Warp" in after["inputs"] and "As Warp" not in before["inputs"]
-    assert not np.array_equal(frames_shown, warped)
-    bpy.ops.ed.undo()
-    found, picture = shown("undone")
-    assert found == before and np.array_equal(picture, frames_shown)
-    bpy.ops.ed.redo()
-    found, picture = shown("done again")
-    assert found == after and np.array_equal(picture, warped)
 
 
 def test_a_take_without_a_warp_is_refused_in_a_sentence(addon, contract, scene, detailed, graded):
@@ -330,10 +289,7 @@ def test_group_of_an_older_file_gains_new_sockets_and_keeps_existing_ones(addon,
 def test_the_command_line_bakes_a_warp_into_the_artists_file(addon, scene, detailed, graded, tmp_path, capsys):
     scene.frame_start = scene.frame_end = 6
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *SIZE, 100
-    settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):
-        settings.media_type = "IMAGE"
-    settings.file_format, settings.color_depth = "OPEN_EXR", "32"
+    set_format(scene, "OPEN_EXR")
     blend = tmp_path / "artist.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     words = ["bake", "--shot", str(detailed), "--output", str(tmp_path / "out"), "--blend", str(blend), "--as-warp"]

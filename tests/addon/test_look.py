@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 
 from tests.addon.data import make_grain as grains
-from tests.addon.data.pixels import read
-
-
-def exr_output(scene, kind: str = "OPEN_EXR") -> None:
-    settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):
-        settings.media_type = "MULTI_LAYER_IMAGE" if kind == "OPEN_EXR_MULTILAYER" else "IMAGE"
-    settings.file_format, settings.color_depth = kind, "32"
-    if kind == "OPEN_EXR":
-        settings.color_mode = "RGBA"
+from tests.addon.data.pixels import read, set_format
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
@@ -40,7 +31,7 @@ def grainy(addon, scene, shot):
     node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     scene.frame_start, scene.frame_end = grains.FRAMES
     addon("scene.scene_setup").keep_plate_colours(scene)
-    exr_output(scene)
+    set_format(scene, "OPEN_EXR")
 
     def render(factor: float) -> np.ndarray:
         node.inputs["Grain"].default_value = factor
@@ -137,7 +128,7 @@ def test_the_plate_passes_through_untouched(addon, scene, shot, pictures, settin
     scene.frame_start = scene.frame_end = 6
     addon("scene.scene_setup").keep_plate_colours(scene)
     if kind != "PNG":
-        exr_output(scene, kind)
+        set_format(scene, kind)
     out = shot / "out"
     addon("bake.rendering").render(scene, out, png=kind == "PNG")
     expected = source / 255.0
@@ -160,7 +151,7 @@ def read_layers(addon, path: Path, folder: Path) -> np.ndarray:
     compat.enable_compositor(scene)
     scene.render.resolution_x, scene.render.resolution_y = 64, 48
     addon("scene.scene_setup").keep_plate_colours(scene)
-    exr_output(scene)
+    set_format(scene, "OPEN_EXR")
     scene.frame_start = scene.frame_end = 1
     addon("bake.rendering").render(scene, folder / "read", png=False)
     return read(folder / "read" / "000001.exr")
@@ -176,10 +167,7 @@ def test_a_render_is_cancelled_between_frames_and_its_file_closed(addon, scene, 
     scene.frame_step = 2
     scene.frame_set(1)
     if movie:
-        settings = scene.render.image_settings
-        if hasattr(settings, "media_type"):
-            settings.media_type = "VIDEO"
-        settings.file_format = "FFMPEG"
+        set_format(scene, "FFMPEG")
         scene.render.ffmpeg.format, scene.render.ffmpeg.codec = "MPEG4", "MPEG4"
     seen = []
 

@@ -12,20 +12,6 @@ import pytest
 WIDTH, HEIGHT = 16, 12
 
 
-def png(pixels: np.ndarray) -> bytes:
-    """Encode [H, W] or [H, W, C] uint8, top row first, as a PNG."""
-    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-    height, width, channels = pixels.shape
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = struct.pack(">IIBBBBB", width, height, 8, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
-    body = zlib.compress(rows.tobytes())
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
-
-
 def unpacked(data: bytes) -> np.ndarray:
     """Decode a PNG with row filter 0 to [H, W, C] uint8."""
     width, height, depth, kind = struct.unpack(">IIBB", data[16:26])
@@ -45,11 +31,11 @@ def labels(frame: int) -> np.ndarray:
 
 
 @pytest.fixture
-def matted(scene, shot):
+def matted(scene, shot, pictures):
     """The shot with mattes, chosen in the scene."""
     (shot / "solve" / "motion").mkdir()
     for frame in (5, 6, 7):
-        (shot / "solve" / "motion" / f"{frame:06d}.png").write_bytes(png(labels(frame)))
+        pictures.write(shot / "solve" / "motion" / f"{frame:06d}.png", labels(frame))
     scene.splannequin.shot_path = str(shot)
     scene.frame_set(6)
     return shot
@@ -61,6 +47,20 @@ def values(image) -> np.ndarray:
     image.pixels.foreach_get(pixels)
     width, height = image.size
     return np.rint(pixels.reshape(height, width, -1)[::-1, :, 0] * 255).astype(np.uint8)
+
+
+def paint_below(image, value: float, channels=slice(0, 3)) -> None:
+    """Set channels of the three lowest rows."""
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    pixels.reshape(HEIGHT, WIDTH, 4)[:3, :, channels] = value
+    image.pixels.foreach_set(pixels)
+    image.update()
+
+
+def reopen(folder) -> None:
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "scene.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "scene.blend"))
 
 
 def test_the_mattes_are_shown_as_a_sequence(matted):
@@ -75,10 +75,7 @@ def test_paint_is_saved_only_in_the_shot(matted, addon):
     assert bpy.ops.splannequin.paint_motion() == {"FINISHED"}
     image = mattes.find_image(matted, 6)
     assert (values(image) == labels(6)).all()
-    pixels = np.empty(len(image.pixels), np.float32)
-    image.pixels.foreach_get(pixels)
-    pixels.reshape(HEIGHT, WIDTH, 4)[:3, :, :3] = 1.0  # the three lowest rows
-    image.pixels.foreach_set(pixels)
+    paint_below(image, 1.0)
     assert bpy.ops.splannequin.save_motion() == {"FINISHED"}
     wanted = labels(6)
     wanted[-3:] = 255
@@ -88,12 +85,12 @@ def test_paint_is_saved_only_in_the_shot(matted, addon):
     assert not image.is_dirty and (values(image) == wanted).all()
 
 
-def test_painting_goes_on_where_it_was_saved(matted, addon):
+def test_painting_goes_on_where_it_was_saved(matted, addon, pictures):
     mattes = addon("solve.mattes")
     (matted / "motion_paint").mkdir()
     painted = np.full((HEIGHT, WIDTH, 2), 255, np.uint8)
     painted[:, 8:, 1] = 0  # nothing is painted in columns from 8 on
-    (matted / "motion_paint" / "000006.png").write_bytes(png(painted))
+    pictures.write(matted / "motion_paint" / "000006.png", painted)
     image = mattes.paint_image(matted, 6)
     assert (values(image)[:, :8] == 255).all() and (values(image)[:, 8:] == labels(6)[:, 8:]).all()
     assert mattes.paint_image(matted, 6) == image, "one image per frame"
@@ -131,8 +128,8 @@ def test_refusals_are_sentences(matted, scene):
         bpy.ops.splannequin.show_motion()
 
 
-def test_oversized_paint_is_not_loaded(matted, scene):
-    content = bytearray(png(np.zeros((4, 4), np.uint8)))
+def test_oversized_paint_is_not_loaded(matted, pictures):
+    content = bytearray(pictures.png(np.zeros((4, 4), np.uint8)))
     content[16:24] = struct.pack(">II", 16000, 16000)
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
     (matted / "motion_paint").mkdir()
@@ -162,24 +159,9 @@ def test_paint_is_found_after_the_file_was_saved_and_opened(matted, addon, tmp_p
     bpy.ops.splannequin.save_motion()
     image = mattes.find_image(matted, 6)
     image.use_fake_user = True
-    bpy.ops.wm.save_as_mainfile(filepath=str(matted.parent / "scene.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(matted.parent / "scene.blend"))
+    reopen(matted.parent)
     image = mattes.find_image(matted, 6)
     assert image is not None and (values(image) == labels(6)).all()
-
-
-def paint_below(image, value: float) -> None:
-    """Paint the three lowest rows."""
-    pixels = np.empty(len(image.pixels), np.float32)
-    image.pixels.foreach_get(pixels)
-    pixels.reshape(HEIGHT, WIDTH, 4)[:3, :, :3] = value
-    image.pixels.foreach_set(pixels)
-    image.update()
-
-
-def reopen(folder) -> None:
-    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "scene.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(folder / "scene.blend"))
 
 
 @pytest.mark.parametrize("saved", [False, True])
@@ -214,10 +196,7 @@ def test_what_was_rubbed_out_and_not_saved_stays_rubbed_out(matted, addon):
     mattes = addon("solve.mattes")
     image = mattes.paint_image(matted, 6)
     image.use_fake_user = True
-    pixels = np.empty(len(image.pixels), np.float32)
-    image.pixels.foreach_get(pixels)
-    pixels.reshape(HEIGHT, WIDTH, 4)[:3, :, 3] = 0.0
-    image.pixels.foreach_set(pixels)
+    paint_below(image, 0.0, 3)
     reopen(matted.parent)
     mattes.save_paint(mattes.find_image(matted, 6))
     written = unpacked(mattes.painted_file(matted, 6).read_bytes())

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
-from tests.addon.data.pixels import read
+from tests.addon.data.pixels import read, set_format
 
 DATA = Path(__file__).resolve().parent / "data"
 SIZE, LENS, DEPTH, MIDDLE = (64, 48), 30.0, 5.0, 4
@@ -62,10 +62,7 @@ def wall(scene):
     scene.render.engine = "CYCLES"
     scene.cycles.device, scene.cycles.samples, scene.cycles.use_denoising = "CPU", 32, False
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *SIZE, 100
-    settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):
-        settings.media_type = "IMAGE"
-    settings.file_format, settings.color_depth, settings.color_mode = "OPEN_EXR", "32", "RGBA"
+    set_format(scene, "OPEN_EXR")
     return camera
 
 

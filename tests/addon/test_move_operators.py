@@ -152,23 +152,6 @@ def test_middle_depth_comes_from_the_take_before_the_points(addon, scene, shaky)
     assert bpy.ops.splannequin.move_orbit(frame=25, distance=3.0) == {"FINISHED"}
 
 
-def test_moves_are_taken_back_and_done_again(addon, scene, shaky):
-    bpy.context.preferences.edit.use_global_undo = True
-    before, last = scene.camera.name, scene.frame_end
-    bpy.ops.ed.undo_push(message="before")
-    bpy.ops.splannequin.move_retime(frame=25)
-    bpy.ops.ed.undo_push(message="after")
-    name = bpy.context.scene.camera.name
-    assert name != before
-    bpy.ops.ed.undo()
-    scene = bpy.context.scene
-    assert name not in scene.objects and scene.splannequin.path_camera is None
-    assert scene.camera.name == before and scene.frame_end == last
-    bpy.ops.ed.redo()
-    scene = bpy.context.scene
-    assert scene.splannequin.path_camera == scene.camera == scene.objects[name] and scene.frame_end > last
-
-
 def test_two_shots_each_keep_their_move(addon, scene, shaky, tmp_path):
     bpy.ops.splannequin.move_smooth()
     one = scene.splannequin.path_camera

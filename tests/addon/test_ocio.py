@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -145,13 +144,7 @@ TO_AP1 = np.linalg.inv([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01
 
 def with_detail(shot, probe):
     """Shot with a take of data/detail and its EXR plates; `probe`: linear Rec.709 light of the contract's `PROBE`."""
-    take = shot / "takes" / "detail"
-    shutil.copytree(DATA / "detail", take)
-    footage = {"file": str(DATA / "detail" / "plate" / "000005.exr"), "beside": "", "size": [56, 42], "first": 5}
-    footage |= {"last": 6, "probe": probe, "space": "light", "map": "", "unlike": ""}
-    facts = {"version": 1, "take": "detail", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 2}
-    facts |= {"width": 56, "height": 42, "first": 5, "last": 6, "camera_path": "", "footage": footage}
-    (take / "take.json").write_text(json.dumps(facts))
+    make_detail.add_take(shot, probe=probe, space="light")
     return shot
 
 

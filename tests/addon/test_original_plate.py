@@ -22,19 +22,13 @@ LINEAR = (0.78125, 0.390625, 0.1953125)
 def footage(scene, shot, tmp_path):
     """footage(...): sets up the take `detail` of an EXR sequence next to the shot, with these facts in take.json."""
     folder = tmp_path / "the plate"
-    shutil.copytree(DATA / "detail" / "plate", folder)
-    take = shot / "takes" / "detail"
-    shutil.copytree(DATA / "detail", take, ignore=shutil.ignore_patterns("plate"))
+    shutil.copytree(make_detail.FOLDER / "plate", folder)
+    take = make_detail.add_take(shot)
     scene.render.resolution_x, scene.render.resolution_y = SIZE
 
     def write_take(**changes):
-        facts = {"version": 1, "take": "detail", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 2}
-        facts |= {"width": SIZE[0], "height": SIZE[1], "first": 5, "last": 6, "camera_path": ""}
-        facts["footage"] = {
-            "file": str(folder / "000005.exr"), "beside": "../the plate/000005.exr", "size": list(SIZE), "first": 5,
-            "last": 6, "probe": list(LINEAR), "space": "linear, Rec.709", "map": "", "unlike": "", **changes,
-        }  # fmt: skip
-        (take / "take.json").write_text(json.dumps(facts))
+        named = {"file": str(folder / "000005.exr"), "beside": "../the plate/000005.exr"}
+        make_detail.write_facts(take, **{**named, **changes})
         return shot
 
     return write_take

@@ -1,6 +1,5 @@
 """The plate's stream in a tree created by a bake belongs to the artist: later bakes keep their changes."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.addon.data import make_detail
+from tests.addon.data.pixels import set_format
 
 DATA = Path(__file__).resolve().parent / "data"
 
@@ -28,9 +28,8 @@ def bake(addon, scene, shot):
 @pytest.fixture
 def footage(scene, shot, tmp_path):
     """footage(...): writes a take `detail` of an EXR sequence, with or without a lens map."""
-    folder, take = tmp_path / "the plate", shot / "takes" / "detail"
-    shutil.copytree(DATA / "detail" / "plate", folder)
-    shutil.copytree(DATA / "detail", take, ignore=shutil.ignore_patterns("plate"))
+    folder, take = tmp_path / "the plate", make_detail.add_take(shot)
+    shutil.copytree(make_detail.FOLDER / "plate", folder)
     scene.render.resolution_x, scene.render.resolution_y = make_detail.WIDTH, make_detail.HEIGHT
     (take / "stmap").mkdir()
     image = bpy.data.images.new("map", make_detail.WIDTH, make_detail.HEIGHT, float_buffer=True, is_data=True)
@@ -43,15 +42,8 @@ def footage(scene, shot, tmp_path):
     bpy.data.images.remove(image)
 
     def write_take(lens: bool = False, reason: str = ""):
-        facts = {"version": 1, "take": "detail", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 2}
-        facts |= {"width": make_detail.WIDTH, "height": make_detail.HEIGHT, "first": 5, "last": 6, "camera_path": ""}
-        facts["footage"] = {
-            "file": str(folder / "000005.exr"), "beside": "", "size": [make_detail.WIDTH, make_detail.HEIGHT],
-            "first": 5, "last": 6, "probe": [0.78125, 0.390625, 0.1953125],
-            "space": "linear, Rec.709", "unlike": reason,
-            "map": "stmap/undistort.exr" if lens else "",
-        }  # fmt: skip
-        (take / "take.json").write_text(json.dumps(facts))
+        stmap = "stmap/undistort.exr" if lens else ""
+        make_detail.write_facts(take, file=str(folder / "000005.exr"), unlike=reason, map=stmap)
 
     return write_take
 
@@ -197,10 +189,8 @@ def test_stream_moved_to_another_plate_renders_like_a_new_one(addon, bake, foota
     def render(name: str) -> np.ndarray:
         _, group = bake("detail")
         group.inputs["Mix"].default_value = 0.0
-        settings = scene.render.image_settings
-        if hasattr(settings, "media_type"):
-            settings.media_type = "IMAGE"
-        settings.file_format, scene.render.filepath = "PNG", str(tmp_path / name)
+        set_format(scene, "PNG")
+        scene.render.filepath = str(tmp_path / name)
         scene.frame_set(6)
         bpy.ops.render.render(write_still=True)
         return pictures.read(tmp_path / name)

@@ -5,13 +5,6 @@ import os
 import shutil
 
 import bpy
-import pytest
-
-
-@pytest.fixture
-def with_shot(scene, shot):
-    scene.splannequin.shot_path = str(shot)
-    return scene
 
 
 def test_a_bake_asks_for_the_scenes_range_and_step_of_the_take(addon, with_shot, shot):

@@ -232,18 +232,6 @@ def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, second
     assert "take freeze" in addon("process.steps").STEPS["bake"].view(two, shots.read(shot)).state[0]
 
 
-def test_undo_brings_a_shot_back(addon, two, shot, second_shot):
-    bpy.ops.ed.undo_push(message="two shots")
-    assert bpy.ops.splannequin.shot_remove("EXEC_DEFAULT", True) == {"FINISHED"}
-    assert addon("shot.selection").folders(bpy.context.scene) == [shot]
-    bpy.ops.ed.undo()
-    scene = bpy.context.scene
-    assert addon("shot.selection").folders(scene) == [shot, second_shot] and scene.splannequin.active_shot == 1
-    assert scene.camera == addon("solve.cameras").find(scene, second_shot, "CAMERA")
-    scene.splannequin.active_shot = 0
-    assert addon("shot.selection").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
-
-
 def ended(addon, contract, folder, step, kind, params, result):
     """A job that the supervisor follows and that has just ended successfully."""
     jobs = addon("process.jobs")

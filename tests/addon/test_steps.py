@@ -11,12 +11,6 @@ import numpy as np
 import pytest
 
 
-@pytest.fixture
-def with_shot(scene, shot):
-    scene.splannequin.shot_path = str(shot)
-    return scene
-
-
 def test_the_import_button_brings_the_clip_in(addon, scene, clip, tmp_path):
     props = scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "s.splannequin")
@@ -94,15 +88,6 @@ def test_relative_paths_follow_the_blend(addon, scene, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.context.scene.splannequin.shot_path = "//x.splannequin"
     assert addon("shot.selection").shot_folder(bpy.context.scene) == tmp_path / "x.splannequin"
-
-
-def test_load_camera_is_one_undo_step(with_shot, shot, addon):
-    bpy.ops.ed.undo_push(message="before")
-    assert bpy.ops.splannequin.load_camera("EXEC_DEFAULT", True) == {"FINISHED"}
-    assert addon("solve.cameras").find(bpy.context.scene, shot, "CAMERA")
-    bpy.ops.ed.undo()
-    assert addon("solve.cameras").find(bpy.context.scene, shot, "CAMERA") is None
-    assert bpy.context.scene.render.resolution_x == 1920, "the scene's own size came back with it"
 
 
 def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, shot):

@@ -9,12 +9,6 @@ import pytest
 
 
 @pytest.fixture
-def with_shot(scene, shot):
-    scene.splannequin.shot_path = str(shot)
-    return scene
-
-
-@pytest.fixture
 def with_raw(shot) -> Path:
     """Shot with the import's pictures, as before the solve."""
     raw = shot / "frames" / "raw"

@@ -1,7 +1,6 @@
 """Surface of a take in Blender: placement, shadow catching and holdout in a render, undo, and two shots."""
 
 import json
-import shutil
 from pathlib import Path
 
 import bpy
@@ -88,17 +87,6 @@ def test_timer_inserts_a_finished_surface(scene, shot, stood, addon):
     assert timer.watch_of(shot).notes["freeze"] and not timer.watch_of(shot).failures
 
 
-def test_undo_removes_it_and_redo_restores_it(scene, shot, stood, addon):
-    bpy.ops.ed.undo_push(message="before")
-    assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
-    bpy.ops.ed.undo_push(message="added")
-    bpy.ops.ed.undo()
-    scene = bpy.context.scene
-    assert not found(addon, scene, shot) and not [m for m in bpy.data.meshes if m.name.endswith(("room", "people"))]
-    bpy.ops.ed.redo()
-    assert len(found(addon, bpy.context.scene, shot)) == 2
-
-
 @pytest.mark.parametrize("way", ["another file", "undo"])
 def test_interrupted_surface_removes_only_its_own_meshes(scene, shot, stood, addon, tmp_path, way):
     timer = addon("process.job_timer")
@@ -127,21 +115,6 @@ def test_what_the_artist_deletes_is_let_go(scene, shot, stood, addon):
     bpy.data.objects.remove(found(addon, scene, shot)[1])
     addon("shot.scene_objects").tidy(scene)
     assert len(addon("shot.scene_objects").of(scene, shot).surfaces) == 1
-
-
-def test_two_shots_of_a_file_have_separate_surfaces(scene, shot, stood, addon, contract, tmp_path):
-    bpy.ops.splannequin.add_surface()
-    second_shot = tmp_path / "other.splannequin"
-    shutil.copytree(shot, second_shot)
-    scene.splannequin.shot_path = str(second_shot)
-    assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
-    write_surface(second_shot, contract)
-    addon("process.job_timer").watch_of(second_shot).state = addon("shot.inventory").read(second_shot)
-    assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
-    first, second = found(addon, scene, shot), found(addon, scene, second_shot)
-    assert len(first) == len(second) == 2 and not set(first) & set(second)
-    addon("freeze.surfaces").remove(scene, second_shot)
-    assert len(found(addon, scene, shot)) == 2 and not found(addon, scene, second_shot)
 
 
 def test_a_render_has_the_shadow_and_what_is_behind_people_is_hidden(scene, shot, stood, addon, tmp_path):

@@ -5,6 +5,8 @@ import json
 import bpy
 import pytest
 
+from tests.addon.data.pixels import set_format
+
 NOTE = "Timecode 01:00:00:10 at frame 5, 24 fps."
 
 
@@ -40,10 +42,7 @@ def test_what_is_rendered_tells_it_and_removal_takes_it_back(addon, dated, tmp_p
     assert f"Note in the metadata of rendered images: {NOTE}" in addon("bake.insertion").insert_freeze(
         scene, shot, "freeze"
     )
-    settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):
-        settings.media_type = "IMAGE"
-    settings.file_format = "OPEN_EXR"
+    set_format(scene, "OPEN_EXR")
     scene.render.resolution_x = scene.render.resolution_y = 8
     scene.render.filepath = str(tmp_path / "out.exr")
     bpy.ops.render.render(write_still=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 import pytest
 
+from tests.addon.data import make_detail
 from tests.addon.data.file_state import difference, file_state
 
 _spec = importlib.util.spec_from_file_location("test_whole_file", Path(__file__).with_name("test_whole_file.py"))
@@ -33,6 +34,7 @@ CALLS = {
 """Arguments of the operators that need some."""
 BEFORE = {
     "combine_cg": ("insert_freeze",),
+    "freeze_as_warp": ("insert_freeze",),
     "insert_matte": ("insert_freeze",),
     "remove_shot": ("insert_freeze", "add_splats", "add_surface"),
     "shot_remove": ("insert_freeze", "shot_add"),
@@ -40,7 +42,6 @@ BEFORE = {
 }
 """Operators that must run before another."""
 TESTED_IN = {
-    "freeze_as_warp": "test_layers.py",  # needs a take of plate-based frames
     "suggested_instant": "needs a live session; it sets what t_star_here sets",
     "use_movie_clip": "needs an editor of clips; it calls use_clip",
 }
@@ -52,10 +53,10 @@ def undoable(addon):
 
 
 NAMES = (
-    "align_floor", "align_origin", "align_scale", "combine_cg", "draw_matte", "insert_freeze", "insert_matte",
-    "load_camera", "locate_shot", "motion_over_plate", "move_hold", "move_orbit", "move_retime", "move_smooth",
-    "paint_motion", "pick_run", "pick_take", "remove_light", "remove_shot", "save_motion", "shot_add", "shot_remove",
-    "show_motion", "t_star_here", "t_star_marker", "use_clip",
+    "align_floor", "align_origin", "align_scale", "combine_cg", "draw_matte", "freeze_as_warp", "insert_freeze",
+    "insert_matte", "load_camera", "locate_shot", "motion_over_plate", "move_hold", "move_orbit", "move_retime",
+    "move_smooth", "paint_motion", "pick_run", "pick_take", "remove_light", "remove_shot", "save_motion", "shot_add",
+    "shot_remove", "show_motion", "t_star_here", "t_star_marker", "use_clip",
 )  # fmt: skip
 
 
@@ -89,6 +90,9 @@ def test_it_is_undone_and_done_again_without_a_trace(ready, addon, name, tmp_pat
     elif name == "use_clip":
         (tmp_path / "other.mp4").touch()
         arguments["filepath"] = str(tmp_path / "other.mp4")
+    elif name == "freeze_as_warp":
+        make_detail.add_take(ready)
+        bpy.context.scene.splannequin.take_name = "detail"
     elif name == "load_camera":
         addon("process.begin").remove_all(bpy.context.scene, ready)
     elif name == "remove_light":

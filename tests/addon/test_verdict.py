@@ -10,12 +10,6 @@ RUN = {"word": "fair", "sentences": ["It does not match the clip in frames 10 to
 TAKE = {"word": "good", "sentences": ["98 % of the picture is plate, 2 % is a guess."]}
 
 
-@pytest.fixture
-def with_shot(scene, shot):
-    scene.splannequin.shot_path = str(shot)
-    return scene
-
-
 def add(path, **more):
     path.write_text(json.dumps(json.loads(path.read_text()) | more))
 

@@ -82,15 +82,11 @@ def test_moved_and_without_the_addon_it_renders_as_before(full, scene, addon, pa
     np.testing.assert_allclose(after, before, atol=1e-4)
 
 
-@pytest.mark.parametrize("button", ["add_splats", "insert_freeze", "combine_cg"])
+@pytest.mark.parametrize("button", ["add_splats", "add_surface"])
 def test_what_a_button_brought_in_is_undone_and_done_again(full, scene, addon, button):
-    if button == "combine_cg":
-        assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
-
     def counts():
-        return {name: len(getattr(bpy.data, name)) for name in ("objects", "images", "node_groups")} | {
-            "nodes": [len(group.nodes) for group in bpy.data.node_groups],
-            "links": len(getattr(addon("compat").compositor_tree(bpy.context.scene), "links", ())),
+        return {name: len(getattr(bpy.data, name)) for name in ("objects", "meshes", "node_groups")} | {
+            "nodes": [len(group.nodes) for group in bpy.data.node_groups]
         }
 
     bpy.ops.ed.undo_push(message="before")
@@ -105,19 +101,27 @@ def test_what_a_button_brought_in_is_undone_and_done_again(full, scene, addon, b
     assert counts() == after
 
 
-def test_two_shots_of_a_file_have_separate_splats(full, scene, addon, contract, tmp_path):
-    assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
+@pytest.mark.parametrize(("button", "module"), [("add_splats", "splats"), ("add_surface", "surfaces")])
+def test_two_shots_of_a_file_have_separate_ones(full, scene, addon, contract, tmp_path, button, module):
     second_shot = tmp_path / "other.splannequin"
-    shutil.copytree(full, second_shot)
-    scene.splannequin.shot_path = str(second_shot)
-    assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
-    fill(scene, second_shot, addon, contract)
-    assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
-    find = addon("freeze.splats").find
-    first, second = find(scene, full, "freeze"), find(scene, second_shot, "freeze")
-    assert first is not None and second is not None and first != second
+    found = {}
+    for shot in (full, second_shot):
+        if shot != full:
+            shutil.copytree(full, shot)
+            scene.splannequin.shot_path = str(shot)
+            assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
+            fill(scene, shot, addon, contract)
+        assert getattr(bpy.ops.splannequin, button)() == {"FINISHED"}
+        found[shot] = objects(addon(f"freeze.{module}"), scene, shot)
+    assert found[full] and found[second_shot] and not found[full] & found[second_shot]
     addon("process.begin").remove_all(scene, second_shot)
-    assert find(scene, full, "freeze") == first and find(scene, second_shot, "freeze") is None
+    assert objects(addon(f"freeze.{module}"), scene, full) == found[full]
+    assert not objects(addon(f"freeze.{module}"), scene, second_shot)
+
+
+def objects(module, scene, shot) -> set:
+    found = module.find(scene, shot, "freeze")
+    return set(found if isinstance(found, (list, tuple)) else [found]) - {None}
 
 
 def add_matte(shot, contract, name):
@@ -139,21 +143,6 @@ def matte_nodes(addon):
         for node in nodes
         if node.bl_idname == "CompositorNodeCryptomatteV2"
     }
-
-
-def test_the_node_of_a_matte_is_undone_and_done_again(full, scene, addon, contract):
-    folder = add_matte(full, contract, "him")
-    assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
-    bpy.ops.ed.undo_push(message="before")
-    images = set(bpy.data.images.keys())
-    assert bpy.ops.splannequin.insert_matte(name="him") == {"FINISHED"}
-    bpy.ops.ed.undo_push(message="after")
-    after = set(bpy.data.images.keys())
-    assert matte_nodes(addon) == {("him", folder, 5)} and after > images
-    bpy.ops.ed.undo()
-    assert matte_nodes(addon) == set() and set(bpy.data.images.keys()) == images
-    bpy.ops.ed.redo()
-    assert matte_nodes(addon) == {("him", folder, 5)} and set(bpy.data.images.keys()) == after
 
 
 def test_two_shots_of_a_file_have_separate_mattes(full, scene, addon, contract, tmp_path):

@@ -8,51 +8,27 @@ import shutil
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from tests.backend.pictures import write
+from tests.backend.quiet import Quiet
 from tests.backend.solved_room import again, solved, tools  # noqa: F401 - fixtures
 from torch_backend.contract import CameraFrame, CameraPath
-from torch_backend.footage.images import write_png
-from torch_backend.motion.mattes import MOVING, PAINTED, STILL, write_matte
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.motion.mattes import MOVING, STILL, write_matte
 from torch_backend.raster import rasterize
 from torch_backend.shot import Shot, write_json
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 16
 FIRST = 101
-
-
-class Quiet:
-    """Reporter that records all events."""
-
-    def __init__(self, cancel_at: tuple[str, float] | None = None):
-        self.events: list[tuple] = []
-        self.cancel_at = cancel_at
-        self.cancelled = False
-
-    def progress(self, stage, done, total, message=""):
-        self.events.append(("progress", stage, done, total, message))
-        if self.cancel_at and stage == self.cancel_at[0] and done / total >= self.cancel_at[1]:
-            self.cancelled = True
-
-    def metric(self, stage, values):
-        self.events.append(("metric", stage, dict(values)))
-
-    def image(self, label, path):
-        self.events.append(("image", label, str(path)))
-
-    def warning(self, message, hint=""):
-        self.events.append(("warning", message, hint))
-
-    def check_cancelled(self):
-        from torch_backend.contract import Cancelled
-
-        if self.cancelled:
-            raise Cancelled
 
 
 @dataclass
@@ -64,6 +40,8 @@ class World:
     K: torch.Tensor
     state: dict[str, torch.Tensor]
     moving: torch.Tensor
+    summary: dict[str, Any] = field(default_factory=dict)
+    """Of the training, if it was trained."""
 
     def at(self, time: float) -> dict[str, torch.Tensor]:
         """The Gaussians at a time in [0, 1]: the patch sways by 0.2 units.
@@ -85,6 +63,43 @@ class World:
             background=torch.full((3,), 0.5),
         )
         return out.colors[0].clamp(0, 1)
+
+    def patch(self, frame: int, time: float) -> np.ndarray:
+        """[H, W]: coverage of the patch, from the pose of a frame, at a time."""
+        state = {name: value[self.moving] for name, value in self.at(time).items()}
+        pose = {"viewmats": self.viewmats[frame : frame + 1], "Ks": self.K[None]}
+        return rasterize(**state, **pose, width=WIDTH, height=HEIGHT).alphas[0].numpy()
+
+
+def outline(mask: np.ndarray) -> list[list[float]]:
+    """Polygon of the largest area of a mask, in pixels."""
+    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return (max(found, key=len)[:, 0] + 0.5).tolist()
+
+
+def film(world: World, folder: Path, picture: Callable[[int], np.ndarray], paint: bool = True, **config) -> Shot:
+    """A shot of pictures in FOLDER/source, of PNG or scene-linear EXR by their type, solved like the world and without
+    a lens. `paint`: everything is painted as static."""
+    from torch_backend.footage import FootageConfig, import_footage
+
+    (folder / "source").mkdir()
+    for n in range(FRAMES):
+        pixels = picture(n)
+        suffix = "png" if pixels.dtype == np.uint8 else "exr"
+        write(folder / "source" / f"a.{FIRST + n}.{suffix}", pixels)
+    shot = Shot.create(folder / "filmed.splannequin")
+    import_footage(shot, str(folder / "source"), FootageConfig(**config), Quiet())
+    shot.solve.mkdir()
+    for name in ("cameras.json", "points.npz"):
+        shutil.copyfile(world.shot.solve / name, shot.solve / name)
+    lens = {"camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
+    write_json(shot.solve_record, {"version": 1, "key": "k", **lens})
+    for n in range(FIRST, FIRST + FRAMES):
+        write_png(shot.plate(n), read_png(shot.raw / f"{n:06d}.png"))
+        if paint:
+            shot.painted_matte(n).parent.mkdir(exist_ok=True)
+            write_matte(shot.painted_matte(n), np.full((HEIGHT, WIDTH), STILL, np.uint8))
+    return shot
 
 
 def build_world(root: Path) -> World:
@@ -121,17 +136,9 @@ def build_world(root: Path) -> World:
 def paint_motion(world: World) -> None:
     """Paint motion mattes of the patch as an artist would: the patch moves too little for optical flow at this size."""
     for n in range(FRAMES):
-        state = world.at(n / (FRAMES - 1))
-        patch = rasterize(
-            **{name: value[world.moving] for name, value in state.items()},
-            viewmats=world.viewmats[n : n + 1],
-            Ks=world.K[None],
-            width=WIDTH,
-            height=HEIGHT,
-        )
-        path = world.shot.root / PAINTED / f"{FIRST + n:06d}.png"
+        path = world.shot.painted_matte(FIRST + n)
         path.parent.mkdir(exist_ok=True)
-        write_matte(path, np.where(patch.alphas[0].numpy() > 0.1, MOVING, STILL).astype(np.uint8))
+        write_matte(path, np.where(world.patch(n, n / (FRAMES - 1)) > 0.1, MOVING, STILL).astype(np.uint8))
 
 
 def _write(world: World) -> None:
@@ -183,7 +190,7 @@ def world(tmp_path_factory) -> World:
 
 
 @pytest.fixture(scope="session")
-def trained(tmp_path_factory):
+def trained(tmp_path_factory) -> World:
     """The tiny shot with one finished run `main` (auto, support) and painted motion mattes.
 
     Tests may add takes, but must not change the run.
@@ -193,8 +200,8 @@ def trained(tmp_path_factory):
 
     world = build_world(tmp_path_factory.mktemp("trained"))
     paint_motion(world)
-    summary = train_shot(world.shot, TrainParams(iterations=900, holdout=8, max_gaussians=1500), Quiet())
-    return world, summary
+    params = TrainParams(iterations=900, holdout=8, max_gaussians=1500)
+    return replace(world, summary=train_shot(world.shot, params, Quiet()))
 
 
 @pytest.fixture(scope="module")
@@ -203,10 +210,9 @@ def trained_copy(trained, tmp_path_factory) -> World:
 
     Takes and instants of this copy do not affect other test files.
     """
-    world, _ = trained
-    root = tmp_path_factory.mktemp("copy") / world.shot.root.name
-    shutil.copytree(world.shot.root, root)
-    return replace(world, shot=Shot.open(root))
+    root = tmp_path_factory.mktemp("copy") / trained.shot.root.name
+    shutil.copytree(trained.shot.root, root)
+    return replace(trained, shot=Shot.open(root))
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from torch_backend.contract import Cancelled, Reporter
+from tests.backend.quiet import Quiet
+from torch_backend.contract import Cancelled
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import write_png
 from torch_backend.motion_search import motion_after_solve
@@ -19,24 +20,6 @@ WIDTH, HEIGHT = 320, 240
 FOCAL, RADIAL = 300.0, -0.06
 COUNT = 21
 STEP = 2
-
-
-class Recorder(Reporter):
-    """Records events; cancels at the first progress of the stage `cancel_at`."""
-
-    def __init__(self, cancel_at=None):
-        self.warnings, self.steps, self.cancel_at, self.cancelled = [], [], cancel_at, False
-
-    def progress(self, stage, done, total, message=""):
-        self.steps.append((stage, done, total))
-        self.cancelled = self.cancelled or stage == self.cancel_at
-
-    def warning(self, message, hint=""):
-        self.warnings.append(message)
-
-    def check_cancelled(self):
-        if self.cancelled:
-            raise Cancelled
 
 
 class Room:
@@ -143,7 +126,7 @@ class Solved:
     shot: Shot
     poses: list
     result: dict
-    report: Recorder
+    report: Quiet
 
 
 @pytest.fixture(scope="session")
@@ -152,7 +135,7 @@ def solved(tmp_path_factory):
     folder = tmp_path_factory.mktemp("room")
     poses = handheld()
     clip = write_clip(folder, poses)
-    shot, report = Shot.create(folder / "room.splannequin"), Recorder()
+    shot, report = Shot.create(folder / "room.splannequin"), Quiet()
     import_footage(shot, str(clip), FootageConfig(step=STEP), report)
     return Solved(shot, poses, solve_all(shot, SolveConfig(features=1500), report), report)
 
@@ -195,7 +178,7 @@ def tools():
         return np.stack([x * np.sin(angle) / radius, y * np.sin(angle) / radius, np.cos(angle)], axis=-1)
 
     class Tools:
-        recorder = Recorder
+        recorder = Quiet
         cancelled = Cancelled
         handheld = staticmethod(handheld)
         room = staticmethod(the_room)

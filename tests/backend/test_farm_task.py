@@ -21,9 +21,8 @@ PLAIN = ("--develop", "off", "--detail", "off", "--no-grain")
 @pytest.fixture(scope="module")
 def submitted(trained, tmp_path_factory):
     """Folder with the trained shot on the submitting computer, and the exported job."""
-    world, _ = trained
     home = tmp_path_factory.mktemp("artist")
-    shutil.copytree(world.shot.root, home / "shots" / "tiny.splannequin")
+    shutil.copytree(trained.shot.root, home / "shots" / "tiny.splannequin")
     words = ["--output", str(home / "job"), "--t-star", "104,110", "--frames", "8", *PLAIN]
     assert cli.main(["farm", "export", str(home / "shots" / "tiny.splannequin"), *words]) == 0
     return home

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -63,11 +64,8 @@ def test_python_threads_launch_concurrently():
         for _ in range(200):
             launch_on(KERNEL, 100 * (n + 1), [outs[n].data_ptr(), float(n + 1)], CPU)
 
-    workers = [threading.Thread(target=work, args=(n,)) for n in range(4)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(work, range(4)))
     for n, out in enumerate(outs):
         assert (out[: 100 * (n + 1)] == 200.0 * (n + 1)).all() and not out[100 * (n + 1) :].any()
 
@@ -113,18 +111,12 @@ def test_workers_do_every_unit_of_every_stage_once(threads):
 
 
 def test_callers_that_run_workers_at_once_do_not_mix():
-    outs = {}
-
     def work(n):
-        outs[n] = [counted(4, n + 1, 700) for _ in range(30)]
+        return [counted(4, n + 1, 700) for _ in range(30)]
 
-    callers = [threading.Thread(target=work, args=(n,)) for n in range(4)]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join()
-    for n, found in outs.items():
-        assert all((out == (n + 1) * (n + 2) / 2).all() for out in found)
+    with ThreadPoolExecutor(4) as pool:
+        for n, outs in enumerate(pool.map(work, range(4))):
+            assert all((out == (n + 1) * (n + 2) / 2).all() for out in outs)
 
 
 class Block(ctypes.Structure):
@@ -265,11 +257,8 @@ def test_workers_may_have_workers():
     def outer(_address, _stage, worker):
         run_workers(inner, Block(), worker, 3)
 
-    callers = [threading.Thread(target=run_workers, args=(outer, Block(), 0, 4)) for _ in range(3)]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join()
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda _: run_workers(outer, Block(), 0, 4), range(3)))
     assert sorted(done) == sorted([(stage, worker) for stage in range(4) for worker in range(3)] * 3)
 
 

@@ -38,8 +38,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture(scope="module")
 def session(trained):
     """The child process after its `ready` message, and that message. Tests must read every answer."""
-    world, _ = trained
-    child = start(world.shot.root)
+    child = start(trained.shot.root)
     header, body = read_message(child.stdout)
     assert body == b""
     yield child, header
@@ -77,7 +76,7 @@ def ask(child, header):
 
 
 def test_ready_message_lists_what_can_be_frozen(session, trained):
-    _, summary = trained
+    summary = trained.summary
     header = session[1]
     assert header["kind"] == "ready"
     assert (header["first"], header["last"]) == (101, 116)
@@ -91,8 +90,7 @@ def test_ready_message_lists_what_can_be_frozen(session, trained):
 
 
 def test_only_instants_that_the_runs_verdict_recommends_are_suggested(trained, quiet):
-    world, _ = trained
-    record = world.shot.run("main") / "summary.json"
+    record = trained.shot.run("main") / "summary.json"
     before = json.loads(record.read_text())
     advised = {
         "word": "fair",
@@ -101,9 +99,9 @@ def test_only_instants_that_the_runs_verdict_recommends_are_suggested(trained, q
     }
     write_json(record, {**before, "verdict": advised})
     try:
-        session = LiveSession(world.shot, "main", "cpu")
+        session = LiveSession(trained.shot, "main", "cpu")
         frames = [s["frame"] for s in session.facts()["suggestions"]]
-        chosen = choose_t_star(world.shot, session.scene, session.run, FreezeParams(), quiet())
+        chosen = choose_t_star(trained.shot, session.scene, session.run, FreezeParams(), quiet())
     finally:
         write_json(record, before)
     assert frames and all(110 <= frame <= 114 for frame in frames) and chosen == frames[0]
@@ -113,36 +111,34 @@ def test_ready_says_why_the_card_is_not_used(session, trained, monkeypatch):
     assert session[1]["note"] == "", "on the processor by wish"
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
     monkeypatch.setattr(device, "card_verdict", lambda: SelfTest(problem="a frame comes out wrong on it"))
-    note = LiveSession(trained[0].shot, "main", "auto").facts()["note"]
+    note = LiveSession(trained.shot, "main", "auto").facts()["note"]
     assert note.startswith("Scrubbing uses the processor, not the graphics card: ") and "doctor --gpu" in note
 
 
 def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
-    world, _ = trained
     part = dict(t_star=112, first=105, last=105, detail="off", develop="off")
-    freeze_shot(world.shot, FreezeParams(take="live", **part), quiet())
-    want = read_frozen_exr(world.shot.take("live") / "000105.exr")
-    rgba, depth = picture(ask(session[0], view_of(world, 105, 112.2, exposed_like=105.0, develop=False)))
+    freeze_shot(trained.shot, FreezeParams(take="live", **part), quiet())
+    want = read_frozen_exr(trained.shot.take("live") / "000105.exr")
+    rgba, depth = picture(ask(session[0], view_of(trained, 105, 112.2, exposed_like=105.0, develop=False)))
     seen = want.rgba[..., 3] > 0.99
     assert seen.mean() > 0.9
     assert np.abs(rgba[..., :3] - linear_to_srgb(want.rgba[..., :3]))[seen].max() < 4e-3
     # A view has the depth of the splats; a take's depth is measured (`surface_depth.py`).
     assert np.median(np.abs(depth[seen] / want.depth[seen] - 1)) < 0.02
     assert bool((depth[rgba[..., 3] == 0] == np.float32(NO_DEPTH)).all())
-    tinted, _ = picture(ask(session[0], view_of(world, 105, 112, show="guesses", exposed_like=105.0, develop=False)))
+    tinted, _ = picture(ask(session[0], view_of(trained, 105, 112, show="guesses", exposed_like=105.0, develop=False)))
     guess = _TINTED * (1.0 - want.support)[..., None]
     expected = rgba[..., :3] * (1.0 - guess) + guess * rgba[..., 3:] * np.array(_TINT)
     assert np.abs(tinted[..., :3] - expected)[seen].max() < 4e-3
     for show in ("support", "motion"):
-        matte, _ = picture(ask(session[0], view_of(world, 105, 112, show=show, develop=False)))
+        matte, _ = picture(ask(session[0], view_of(trained, 105, 112, show=show, develop=False)))
         assert np.abs(matte[..., 0] - getattr(want, show) * want.rgba[..., 3]).max() < 4e-3
 
 
 def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, trained, quiet):
-    world, _ = trained
-    freeze_shot(world.shot, FreezeParams(take="plates", t_star=112, first=105, last=105), quiet())
-    want = read_frozen_exr(world.shot.take("plates") / "000105.exr")
-    request = view_of(world, 105, 112.2, exposed_like=105.0)
+    freeze_shot(trained.shot, FreezeParams(take="plates", t_star=112, first=105, last=105), quiet())
+    want = read_frozen_exr(trained.shot.take("plates") / "000105.exr")
+    request = view_of(trained, 105, 112.2, exposed_like=105.0)
     request["viewmat"] = [v + 1e-6 for v in request["viewmat"]]  # rounding as from Blender
     splats, plates = (picture(ask(session[0], {**request, "detail": detail})) for detail in (False, True))
     shown = linear_to_srgb(want.rgba[..., :3]).clip(0, 1)
@@ -161,11 +157,10 @@ def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, traine
 
 @pytest.mark.parametrize("size", [(64, 48), (150, 60), (20, 30)])
 def test_view_of_any_size_uses_plates(trained, size):
-    world, _ = trained
-    session = LiveSession(world.shot, "main", "cpu")
+    session = LiveSession(trained.shot, "main", "cpu")
     width, height = size
     k = [width * 60 / 64, width * 60 / 64, 0.4 * width, 0.6 * height]
-    request = {**view_of(world, 105, 105, *size, exposed_like=105.0), "K": k}
+    request = {**view_of(trained, 105, 105, *size, exposed_like=105.0), "K": k}
     del request["kind"]
     splats, plates = (picture(session.draw(LiveView(**request, detail=detail)))[0] for detail in (False, True))
     assert plates.shape == (height, width, 4)
@@ -176,7 +171,6 @@ def test_view_of_any_size_uses_plates(trained, size):
 
 
 def test_plate_view_yields_to_a_newer_request_and_finishes_later(session, trained):
-    world, _ = trained
     child, _ = session
     requests = [
         {"view": 1, "seq": 1, "detail": True},
@@ -186,13 +180,13 @@ def test_plate_view_yields_to_a_newer_request_and_finishes_later(session, traine
         {"view": 2, "seq": 5},
     ]
     for change in requests:
-        write_message(child.stdin, {**view_of(world, 105, 108, exposed_like=105.0), **change})
+        write_message(child.stdin, {**view_of(trained, 105, 108, exposed_like=105.0), **change})
     came = []
     while not {1, 4, 5} <= set(came):
         header, _ = read_message(child.stdout)
         assert header["kind"] == "frame"
         came.append(header["seq"])
-    write_message(child.stdin, {**view_of(world, 105, 108), "view": 9, "seq": 9})
+    write_message(child.stdin, {**view_of(trained, 105, 108), "view": 9, "seq": 9})
     while came[-1] != 9:  # an abandoned view is not drawn later
         came.append(read_message(child.stdout)[0]["seq"])
     assert len(set(came)) == len(came)
@@ -200,14 +194,13 @@ def test_plate_view_yields_to_a_newer_request_and_finishes_later(session, traine
 
 
 def test_plate_view_is_interruptible_between_plates(trained):
-    world, _ = trained
-    session = LiveSession(world.shot, "main", "cpu")
-    request = {k: v for k, v in view_of(world, 105, 112, exposed_like=105.0).items() if k != "kind"}
+    session = LiveSession(trained.shot, "main", "cpu")
+    request = {k: v for k, v in view_of(trained, 105, 112, exposed_like=105.0).items() if k != "kind"}
     view = LiveView(**request, detail=True)
     turns = iter([False, False, True])
     with pytest.raises(Superseded):
         session.draw(view, lambda: next(turns))
-    again, fresh = session.draw(view)[1], LiveSession(world.shot, "main", "cpu").draw(view)[1]
+    again, fresh = session.draw(view)[1], LiveSession(trained.shot, "main", "cpu").draw(view)[1]
     assert again == fresh, "what was given up leaves nothing behind"
     newer = dataclasses.replace(view, seq=9)
     waiting = _Waiting()
@@ -222,17 +215,16 @@ def test_plate_view_is_interruptible_between_plates(trained):
 
 
 def test_missing_footage_is_reported_and_splat_views_continue(trained, tmp_path):
-    world, _ = trained
-    shutil.copytree(world.shot.root, tmp_path / "torn.splannequin")
+    shutil.copytree(trained.shot.root, tmp_path / "torn.splannequin")
     child = start(tmp_path / "torn.splannequin")
     try:
         read_message(child.stdout)
         for picture_file in (tmp_path / "torn.splannequin" / "frames").glob("*.png"):
             picture_file.write_bytes(b"torn")
-        header, _ = ask(child, view_of(world, 105, 108, detail=True))
+        header, _ = ask(child, view_of(trained, 105, 108, detail=True))
         assert (header["kind"], header["seq"]) == ("error", 7)
         assert "damaged" in header["message"] or "cannot be read" in header["message"]
-        picture(ask(child, view_of(world, 105, 108)))
+        picture(ask(child, view_of(trained, 105, 108)))
     finally:
         child.stdin.close()
         assert child.wait(20) == 0
@@ -240,10 +232,9 @@ def test_missing_footage_is_reported_and_splat_views_continue(trained, tmp_path)
 
 
 def test_guesses_are_tinted_by_how_ill_they_were_seen(trained):
-    world, _ = trained
-    session = LiveSession(world.shot, "main", "cpu")
+    session = LiveSession(trained.shot, "main", "cpu")
     session._at(112, True).support[:] = 0.25
-    request = {k: v for k, v in view_of(world, 105, 112).items() if k != "kind"}
+    request = {k: v for k, v in view_of(trained, 105, 112).items() if k != "kind"}
     plain, tinted = (picture(session.draw(LiveView(**request, show=show)))[0] for show in ("color", "guesses"))
     guess = 0.75 * _TINTED
     expected = plain[..., :3] * (1.0 - guess) + guess * plain[..., 3:] * np.array(_TINT)
@@ -253,9 +244,8 @@ def test_guesses_are_tinted_by_how_ill_they_were_seen(trained):
 
 
 def test_two_instants_differ_where_the_patch_moved(session, trained):
-    world, _ = trained
-    early, late = (picture(ask(session[0], view_of(world, 108, t)))[0] for t in (105, 112))
-    truth = (world.image(7, 4 / 15) - world.image(7, 11 / 15)).abs().mean(-1).numpy()
+    early, late = (picture(ask(session[0], view_of(trained, 108, t)))[0] for t in (105, 112))
+    truth = (trained.image(7, 4 / 15) - trained.image(7, 11 / 15)).abs().mean(-1).numpy()
     assert np.abs(early - late)[truth > 0.1].mean() > 0.05
 
 
@@ -269,8 +259,7 @@ def test_two_instants_differ_where_the_patch_moved(session, trained):
     ],
 )
 def test_a_request_that_makes_no_sense_is_answered_in_words_and_the_session_goes_on(session, trained, change, words):
-    world, _ = trained
-    request = {**view_of(world, 105, 105), **change}
+    request = {**view_of(trained, 105, 105), **change}
     if words is None:
         with pytest.raises(ValueError, match="JSON"):
             write_message(session[0].stdin, request)
@@ -278,12 +267,11 @@ def test_a_request_that_makes_no_sense_is_answered_in_words_and_the_session_goes
         header, _ = ask(session[0], request)
         assert (header["kind"], header["seq"]) == ("error", 7)
         assert words in header["message"]
-    picture(ask(session[0], view_of(world, 105, 105)))
+    picture(ask(session[0], view_of(trained, 105, 105)))
 
 
 def test_a_shot_without_the_run_ends_in_a_sentence(trained):
-    world, _ = trained
-    child = start(world.shot.root, "other")
+    child = start(trained.shot.root, "other")
     header, _ = read_message(child.stdout)
     assert header["kind"] == "error"
     assert "'other'" in header["message"]
@@ -293,10 +281,9 @@ def test_a_shot_without_the_run_ends_in_a_sentence(trained):
 
 
 def test_newer_requests_replace_those_that_wait(trained):
-    world, _ = trained
     stream = io.BytesIO()
     for seq, view in ((1, 1), (2, 2), (3, 1)):
-        write_message(stream, {**view_of(world, 105, 105), "seq": seq, "view": view})
+        write_message(stream, {**view_of(trained, 105, 105), "seq": seq, "view": view})
     stream.seek(0)
     waiting = _Waiting()
     waiting.read(stream)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from torch_backend import contract, job
@@ -25,10 +24,9 @@ LONG = "x" * 300
 @pytest.fixture(scope="module")
 def place(trained, tmp_path_factory):
     """Folder with a trained shot `s`, a plain file `file`, and broken camera paths."""
-    world, _ = trained
     folder = tmp_path_factory.mktemp("words")
     ignored = shutil.ignore_patterns("jobs", "takes")
-    shutil.copytree(world.shot.root, folder / "s", ignore=ignored)
+    shutil.copytree(trained.shot.root, folder / "s", ignore=ignored)
     (folder / "file").write_text("no folder")
     (folder / "deep.json").write_text("[" * 200_000)
     (folder / "list.json").write_text("[]")
@@ -123,31 +121,6 @@ def test_wrong_arguments_are_one_sentence(capsys, place, arguments, word):
 def test_what_the_shot_lacks_is_one_sentence(capsys, place, arguments, code, word):
     got, text = said(capsys, place, *arguments.split(" "))
     assert (got, word in text, "Traceback" in text) == (code, True, False), text
-
-
-@pytest.mark.parametrize("kind", ["cut", "noise", "text", "shape", "nan", "empty"])
-def test_damaged_points_are_named(capsys, place, tmp_path, kind):
-    shot = shutil.copytree(place / "s", tmp_path / "d")
-    points = shot / "solve" / "points.npz"
-    with np.load(points) as stored:
-        arrays = dict(stored)
-    if kind == "cut":
-        points.write_bytes(points.read_bytes()[:700])
-    elif kind in ("noise", "text", "empty"):
-        points.write_bytes({"noise": bytes(range(256)) * 9, "text": b"points", "empty": b""}[kind])
-    else:
-        arrays["xyz"] = arrays["xyz"][:5] if kind == "shape" else arrays["xyz"] * np.nan
-        np.savez(points, **arrays)
-    code, text = said(capsys, tmp_path, "train", "{}/d", *SMALL, "--run", "other")
-    assert code == ExitCode.SOLVE and "points.npz is damaged" in text and "Solve the camera again." in text
-
-
-@pytest.mark.parametrize("content", ["[" * 200_000, "{}", '{"frames": [3]}', '{"frames": [{"frame": 101}]}'])
-def test_a_damaged_listing_is_named(capsys, place, tmp_path, content):
-    shot = shutil.copytree(place / "s", tmp_path / "d")
-    (shot / "frames" / "frames.json").write_text(content)
-    code, text = said(capsys, tmp_path, "train", "{}/d", *SMALL, "--run", "other")
-    assert code == ExitCode.FOOTAGE and "frames.json is damaged" in text and "Traceback" not in text
 
 
 @pytest.mark.parametrize(

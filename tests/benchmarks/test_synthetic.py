@@ -36,7 +36,8 @@ from benchmarks.synthetic.shot import (
     surface_points,
 )
 from benchmarks.synthetic.sizes import HARD, HELD, KINDS, OBJECT_PREFIX, REPORT_SEEDS, SIZES, TUNING_SEEDS
-from torch_backend.contract import CameraFrame, CameraPath, Reporter, read_json
+from tests.backend.quiet import Quiet
+from torch_backend.contract import CameraFrame, CameraPath, read_json
 from torch_backend.footage.images import read_png
 from torch_backend.scene import load_scene
 from torch_backend.shot import write_json
@@ -44,10 +45,6 @@ from torch_backend.shot import write_json
 ROOT = Path(__file__).resolve().parents[2]
 TINY = SIZES["tiny"]
 SEED = 0
-
-
-class Silent(Reporter):
-    pass
 
 
 @pytest.fixture(scope="session")
@@ -416,7 +413,7 @@ def test_mirror_shows_the_room_and_object_can_be_removed(hard, tmp_path):
 
 
 def test_an_exact_shot_is_one_that_the_product_trains_on(scene, tmp_path):
-    shot = exact_shot(scene, tmp_path / "exact.splannequin", Silent())
+    shot = exact_shot(scene, tmp_path / "exact.splannequin", Quiet())
     loaded = load_scene(shot)
     assert loaded.frames == scene.frames and len(loaded.solved) == 12 and len(loaded.points) > 100
     centres = -np.einsum("nji,nj->ni", loaded.viewmats[:, :3, :3].numpy(), loaded.viewmats[:, :3, 3].numpy())
@@ -424,7 +421,7 @@ def test_an_exact_shot_is_one_that_the_product_trains_on(scene, tmp_path):
     pixels, depth = project(scene, 1, loaded.points.numpy() / loaded.scale + loaded.centre)
     inside = (depth > 0) & (pixels > 0).all(axis=1) & (pixels < [scene.width, scene.height]).all(axis=1)
     assert inside.mean() > 0.3
-    exact_shot(scene, tmp_path / "exact.splannequin", Silent())
+    exact_shot(scene, tmp_path / "exact.splannequin", Quiet())
     unchanged = SolvedPixels(shot)
     assert (unchanged.picture(scene.truth(9, 1)) == scene.truth(9, 1)).all()
     assert (unchanged.regions(scene.regions(9, 1)).seen == scene.regions(9, 1).seen).all()
@@ -439,7 +436,7 @@ def test_surface_points_lie_on_what_the_frames_see(scene):
 
 
 def test_the_similarity_leads_from_solved_cameras_to_exact_ones(scene, tmp_path):
-    shot = import_clip(scene, tmp_path / "solved.splannequin", Silent())
+    shot = import_clip(scene, tmp_path / "solved.splannequin", Quiet())
     rng = np.random.default_rng(3)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     rotation *= np.linalg.det(rotation)

@@ -65,32 +65,34 @@ def write_lock(requirements: Path):
 
 
 @pytest.fixture
-def environment(tmp_path: Path, write_lock, write_wheel) -> environments.Environment:
+def bare_environment(tmp_path: Path, write_lock, write_wheel) -> environments.Environment:
     """An environment of one small package, not set up yet."""
     write_lock("small", write_wheel("smallthing", "1.0", "value = 1"))
     return environments.Environment("the test", tmp_path / "home" / ".venv", ("small",), "import smallthing", 0.01)
 
 
+def start(folder: Path) -> None:
+    """Create the virtual environment that a set-up starts with, in a tenth of the time.
+
+    It uses the pip of the current Python. If there is none, the set-up creates the environment again.
+    """
+    command = [sys.executable, "-P", "-m", "venv", "--without-pip", "--system-site-packages", str(folder)]
+    subprocess.run(command, check=True)
+    (folder / ".splannequin").mkdir()
+
+
+@pytest.fixture
+def environment(bare_environment: environments.Environment) -> environments.Environment:
+    """An environment of one small package, whose set-up was only begun."""
+    start(bare_environment.folder)
+    return bare_environment
+
+
 @pytest.fixture
 def with_torch(environment: environments.Environment, write_lock, write_wheel) -> environments.Environment:
-    """An environment of that package and of a torch, not set up yet."""
+    """That environment with a torch."""
     write_lock("torch", write_wheel("torch", "2.13.0", ""))
     write_lock("torch-cpu")
     write_lock("torch-cu130")
     write_lock("cuda", write_wheel("nvidia_small", "1.0", ""))
     return dataclasses.replace(environment, disk_gb=environments.BACKEND_DISK_GB, torch=True)
-
-
-@pytest.fixture
-def make_environment():
-    """make_environment(folder): creates the virtual environment that a set-up starts with, in a tenth of the time.
-
-    It uses the pip of the current Python. If there is none, the set-up creates the environment again.
-    """
-
-    def make(folder: Path) -> None:
-        command = [sys.executable, "-P", "-m", "venv", "--without-pip", "--system-site-packages", str(folder)]
-        subprocess.run(command, check=True)
-        (folder / ".splannequin").mkdir()
-
-    return make

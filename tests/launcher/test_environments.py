@@ -25,22 +25,21 @@ def site_packages(environment: Environment) -> Path:
 
 
 def test_set_up_once_then_nothing_is_started(
-    environment: Environment, monkeypatch: pytest.MonkeyPatch, hostile, tmp_path: Path
+    bare_environment: Environment, monkeypatch: pytest.MonkeyPatch, hostile, tmp_path: Path
 ):
     # modules in folders where a child process could run
     trap = hostile(tmp_path / "clips", tmp_path / "home", tmp_path)
-    assert not environment.ready()
-    assert set_up(environment, sys.executable) > 0
-    assert environment.ready()
+    assert not bare_environment.ready()
+    assert set_up(bare_environment, sys.executable) > 0
+    assert bare_environment.ready()
     assert not trap.exists(), trap.read_text()
-    assert value_of(environment) == "1"
+    assert value_of(bare_environment) == "1"
 
     monkeypatch.setattr(subprocess, "Popen", None)  # any child process would now fail
-    assert set_up(environment, "no such python") == 0
+    assert set_up(bare_environment, "no such python") == 0
 
 
-def test_changed_requirements_are_installed(environment: Environment, write_lock, write_wheel, make_environment):
-    make_environment(environment.folder)
+def test_changed_requirements_are_installed(environment: Environment, write_lock, write_wheel):
     set_up(environment, sys.executable)
     write_lock("small", write_wheel("smallthing", "2.0", "value = 2"))
     assert not environment.ready()
@@ -48,10 +47,7 @@ def test_changed_requirements_are_installed(environment: Environment, write_lock
     assert value_of(environment) == "2"
 
 
-def test_a_superset_of_the_requirements_is_ready_for_the_subset(
-    environment: Environment, write_lock, write_wheel, make_environment
-):
-    make_environment(environment.folder)
+def test_a_superset_of_the_requirements_is_ready_for_the_subset(environment: Environment, write_lock, write_wheel):
     write_lock("more", write_wheel("otherthing", "1.0", ""))
     more = dataclasses.replace(environment, requirements=("small", "more"))
     set_up(environment, sys.executable)
@@ -60,10 +56,7 @@ def test_a_superset_of_the_requirements_is_ready_for_the_subset(
     assert more.ready() and environment.ready()
 
 
-def test_nothing_is_installed_that_the_lock_does_not_name(
-    environment: Environment, write_lock, write_wheel, make_environment
-):
-    make_environment(environment.folder)
+def test_nothing_is_installed_that_the_lock_does_not_name(environment: Environment, write_lock, write_wheel):
     set_up(environment, sys.executable)
     write_wheel("hanger_on", "1.0", "")
     write_lock("more", write_wheel("otherthing", "1.0", "", needs="hanger-on"))
@@ -72,11 +65,8 @@ def test_nothing_is_installed_that_the_lock_does_not_name(
     assert more.ready() and not list(site_packages(environment).glob("hanger_on*"))
 
 
-def test_a_file_with_another_hash_is_not_installed(
-    environment: Environment, write_wheel, tmp_path: Path, make_environment
-):
+def test_a_file_with_another_hash_is_not_installed(environment: Environment, write_wheel, tmp_path: Path):
     """The package index, or a folder of wheels, has another file under the same name and version."""
-    make_environment(environment.folder)
     write_wheel("smallthing", "1.0", "value = 'of somebody else'")
     for wheels in (None, tmp_path):
         with pytest.raises(LauncherError, match="smallthing .*SHA-256 differs") as refused:
@@ -85,8 +75,7 @@ def test_a_file_with_another_hash_is_not_installed(
     assert not list(environment.folder.rglob("smallthing*"))
 
 
-def test_a_requirement_without_a_hash_is_not_installed(environment: Environment, requirements: Path, make_environment):
-    make_environment(environment.folder)
+def test_a_requirement_without_a_hash_is_not_installed(environment: Environment, requirements: Path):
     (requirements / "small.lock").write_text("smallthing==1.0\n")
     with pytest.raises(LauncherError, match="installing packages"):
         set_up(environment, sys.executable)
@@ -94,9 +83,8 @@ def test_a_requirement_without_a_hash_is_not_installed(environment: Environment,
 
 
 def test_wheel_folder_uses_no_index(
-    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, write_lock, write_wheel, make_environment
+    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, write_lock, write_wheel
 ):
-    make_environment(environment.folder)
     monkeypatch.delenv("PIP_NO_INDEX")
     monkeypatch.delenv("PIP_FIND_LINKS")
     monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")  # nobody listens there
@@ -114,10 +102,9 @@ def test_wheel_folder_uses_no_index(
 
 
 def test_only_torch_uses_the_torch_index(
-    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_environment, write_lock, write_wheel
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, write_lock, write_wheel
 ):
     """No other package is installed from that index, whatever its version."""
-    make_environment(with_torch.folder)
     index = tmp_path / "whl" / "cpu"
     theirs = write_wheel("torch", "2.13.0+cpu", "build = 'cpu'")
     write_lock("torch-cpu", theirs)
@@ -139,10 +126,9 @@ def test_only_torch_uses_the_torch_index(
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere PyPI's build is the one without CUDA")
 def test_the_build_of_an_index_out_of_reach_is_taken_where_pip_finds_it(
-    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_environment, write_lock, write_wheel
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, write_lock, write_wheel
 ):
     """pip is configured with a folder that has the build, as here and in CI. A file with another hash is refused."""
-    make_environment(with_torch.folder)
     monkeypatch.delenv("SPLANNEQUIN_TORCH_INDEX", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))  # no NVIDIA driver
     monkeypatch.setattr(environments, "_reachable", lambda _: False)
@@ -157,10 +143,7 @@ def test_the_build_of_an_index_out_of_reach_is_taken_where_pip_finds_it(
         set_up(with_torch, sys.executable)
 
 
-def test_cuda_libraries_come_only_with_a_torch_that_asks_for_them(
-    with_torch: Environment, write_lock, write_wheel, make_environment
-):
-    make_environment(with_torch.folder)
+def test_cuda_libraries_come_only_with_a_torch_that_asks_for_them(with_torch: Environment, write_lock, write_wheel):
     set_up(with_torch, sys.executable)
     packages = site_packages(with_torch)
     assert not list(packages.glob("nvidia_small*"))
@@ -187,8 +170,7 @@ def damage(packages: Path, how: str) -> None:
         (info / "RECORD").write_text("".join(line for line in record if not line.startswith("smallthing.py")))
 
 
-def test_a_package_that_was_changed_is_noticed_and_repaired(environment: Environment, capsys, make_environment):
-    make_environment(environment.folder)
+def test_a_package_that_was_changed_is_noticed_and_repaired(environment: Environment, capsys):
     set_up(environment, sys.executable)
     for how in ("removed", "file removed", "exchanged", "cut off", "record forged"):
         damage(site_packages(environment), how)
@@ -199,18 +181,14 @@ def test_a_package_that_was_changed_is_noticed_and_repaired(environment: Environ
         assert "smallthing" in capsys.readouterr().out
 
 
-def test_what_somebody_installs_besides_is_no_change(
-    environment: Environment, write_wheel, tmp_path: Path, make_environment
-):
-    make_environment(environment.folder)
+def test_what_somebody_installs_besides_is_no_change(environment: Environment, write_wheel, tmp_path: Path):
     set_up(environment, sys.executable)
     wheel = write_wheel("otherthing", "1.0", "")
     subprocess.run([environment.python, "-m", "pip", "install", "-q", str(wheel)], check=True)
     assert environment.ready()
 
 
-def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment, make_environment):
-    make_environment(environment.folder)
+def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment):
     set_up(environment, sys.executable)
     packages = site_packages(environment)
     # State after a kill during pip: the marker, a package with missing files, no RECORD.
@@ -223,35 +201,32 @@ def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Env
     assert value_of(environment) == "1"
 
 
-def test_environment_without_an_interpreter_is_recreated(environment: Environment):
-    environment.state.mkdir(parents=True)
-    (environment.folder / "pyvenv.cfg").touch()
-    set_up(environment, sys.executable)
-    assert value_of(environment) == "1"
+def test_environment_without_an_interpreter_is_recreated(bare_environment: Environment):
+    bare_environment.state.mkdir(parents=True)
+    (bare_environment.folder / "pyvenv.cfg").touch()
+    set_up(bare_environment, sys.executable)
+    assert value_of(bare_environment) == "1"
 
 
-def test_manually_created_environment_is_adopted(environment: Environment):
-    subprocess.run([sys.executable, "-m", "venv", str(environment.folder)], check=True)
-    kept = environment.folder / "kept"
+def test_manually_created_environment_is_adopted(bare_environment: Environment):
+    subprocess.run([sys.executable, "-m", "venv", str(bare_environment.folder)], check=True)
+    kept = bare_environment.folder / "kept"
     kept.touch()
-    set_up(environment, sys.executable)
-    assert environment.ready() and kept.exists()
+    set_up(bare_environment, sys.executable)
+    assert bare_environment.ready() and kept.exists()
 
 
-def test_foreign_folder_is_not_changed(environment: Environment):
-    environment.folder.mkdir(parents=True)
-    precious = environment.folder / "precious.txt"
+def test_foreign_folder_is_not_changed(bare_environment: Environment):
+    bare_environment.folder.mkdir(parents=True)
+    precious = bare_environment.folder / "precious.txt"
     precious.touch()
     with pytest.raises(LauncherError, match="move it, or set SPLANNEQUIN_HOME") as refused:
-        set_up(environment, sys.executable)
+        set_up(bare_environment, sys.executable)
     assert precious.exists()
     assert refused.value.exit_code == 9
 
 
-def test_a_package_that_cannot_be_had_names_step_log_and_remedy(
-    environment: Environment, requirements: Path, make_environment
-):
-    make_environment(environment.folder)
+def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Environment, requirements: Path):
     (requirements / "small.lock").write_text(f"there-is-no-such-package==1.0 --hash=sha256:{'0' * 64}\n")
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)
@@ -264,39 +239,34 @@ def test_a_package_that_cannot_be_had_names_step_log_and_remedy(
     assert not environment.ready()
 
 
-def test_a_package_that_does_not_import_is_not_ready(
-    environment: Environment, write_lock, write_wheel, make_environment
-):
-    make_environment(environment.folder)
+def test_a_package_that_does_not_import_is_not_ready(environment: Environment, write_lock, write_wheel):
     write_lock("small", write_wheel("smallthing", "3.0", "import absent_library"))
     with pytest.raises(LauncherError, match="absent_library"):
         set_up(environment, sys.executable)
     assert not environment.ready()
 
 
-def test_a_full_disk_is_said_before_anything_is_written(environment: Environment):
+def test_a_full_disk_is_said_before_anything_is_written(bare_environment: Environment):
     with pytest.raises(LauncherError, match="GB free") as refused:
-        set_up(dataclasses.replace(environment, disk_gb=1e9), sys.executable)
+        set_up(dataclasses.replace(bare_environment, disk_gb=1e9), sys.executable)
     assert refused.value.exit_code == 8
-    assert not environment.folder.exists()
+    assert not bare_environment.folder.exists()
 
 
 @pytest.mark.parametrize(("index", "needed"), [("/whl/cpu", 4), ("/whl/cu130", 9)])
 def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
-    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_environment, index: str, needed: int
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, index: str, needed: int
 ):
-    backend = with_torch
+    shutil.rmtree(with_torch.folder)
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", f"file://{tmp_path}{index}")
     disk = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 - 1e8)))
     with pytest.raises(LauncherError, match=f"needs {needed} GB, but .* has {needed - 0.1:.1f} GB free") as refused:
-        set_up(backend, sys.executable)
+        set_up(with_torch, sys.executable)
     assert refused.value.exit_code == 8
-    assert not backend.folder.exists()
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 + 1e8)))
-    make_environment(backend.folder)
-    set_up(backend, sys.executable)
-    assert backend.ready()
+    set_up(with_torch, sys.executable)
+    assert with_torch.ready()
 
 
 @pytest.mark.parametrize(("system", "needed"), [("linux", 9.0), ("win32", 4.0), ("darwin", 4.0)])
@@ -309,12 +279,12 @@ def test_an_index_out_of_reach_is_not_reckoned_with(
     with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
 ):
     """torch is then installed from the usual index, which on Linux has the build with CUDA."""
-    backend = with_torch
+    shutil.rmtree(with_torch.folder)
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "http://127.0.0.1:9/whl/cpu")
     disk = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(5e9)))
     with pytest.raises(LauncherError, match="needs 9 GB"):
-        set_up(backend, sys.executable)
+        set_up(with_torch, sys.executable)
     assert "cannot be reached: torch is installed from the usual index" in capsys.readouterr().out
 
 
@@ -403,9 +373,8 @@ def offline(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_index_that_cannot_be_reached_is_what_is_wrong(
-    environment: Environment, requirements: Path, offline, make_environment, monkeypatch: pytest.MonkeyPatch
+    environment: Environment, requirements: Path, offline, monkeypatch: pytest.MonkeyPatch
 ):
-    make_environment(environment.folder)
     (requirements / "small.lock").write_text(f"smallthing==1.0 --hash=sha256:{'0' * 64}\n")
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)
@@ -421,9 +390,9 @@ def test_an_index_that_cannot_be_reached_is_what_is_wrong(
 
 
 @pytest.mark.parametrize("home", ["file", "file/below", "n" * 300])
-def test_a_home_that_cannot_be_is_one_sentence(environment: Environment, tmp_path: Path, home: str):
+def test_a_home_that_cannot_be_is_one_sentence(bare_environment: Environment, tmp_path: Path, home: str):
     (tmp_path / "file").touch()
-    placed = dataclasses.replace(environment, folder=tmp_path / home / ".venv")
+    placed = dataclasses.replace(bare_environment, folder=tmp_path / home / ".venv")
     with pytest.raises(LauncherError) as refused:
         set_up(placed, sys.executable)
     message = str(refused.value)

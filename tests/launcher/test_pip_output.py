@@ -46,9 +46,11 @@ def test_pip_in_one_line_per_package(line: str, shown: str | None):
         ("ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device", "free some disk"),
     ],
 )
-def test_what_pip_prints_in_a_sentence(environment: Environment, printed: str, says: str):
+def test_what_pip_prints_in_a_sentence(bare_environment: Environment, printed: str, says: str):
     with pytest.raises(LauncherError) as refused:
-        pip_output.refuse(environment.name, environment.log, "installing packages", printed, system="linux-x86_64")
+        pip_output.refuse(
+            bare_environment.name, bare_environment.log, "installing packages", printed, system="linux-x86_64"
+        )
     assert says in str(refused.value)
 
 
@@ -59,13 +61,13 @@ def test_what_pip_prints_in_a_sentence(environment: Environment, printed: str, s
         ("linux-aarch64", "Linux on ARM"), ("linux-riscv64", "linux-riscv64"),
     ],
 )  # fmt: skip
-def test_system_without_wheels_is_not_reported_as_wrong_python(environment: Environment, system, words):
+def test_system_without_wheels_is_not_reported_as_wrong_python(bare_environment: Environment, system, words):
     printed = (
         "ERROR: Could not find a version that satisfies the requirement torch==2.13.0 (from versions: 2.2.0, 2.2.1)\n"
         "ERROR: No matching distribution found for torch==2.13.0"
     )
     with pytest.raises(LauncherError) as refused:
-        pip_output.refuse(environment.name, environment.log, "installing packages", printed, system=system)
+        pip_output.refuse(bare_environment.name, bare_environment.log, "installing packages", printed, system=system)
     said = str(refused.value)
     assert "there is no torch" in said and words in said and "use Python 3.11" not in said
 

@@ -14,7 +14,6 @@ Rejected: `Frozen.Combined.R ...` (the same sockets, but no plain RGBA in other 
 from __future__ import annotations
 
 import errno
-import functools
 import math
 import os
 import shutil
@@ -32,6 +31,7 @@ from ..contract.timecode import smpte_bits
 from ..footage.color import LIGHTS, PRIMARIES, InputSpace, in_light, light_matrix, light_of_chromaticities
 from ..footage.images import error_of
 from ..shot import atomic_path
+from .exr_rows import Packing
 
 CHANNELS = channels_of("")
 """Channel names in the order of the arrays: colour, depth, support matte, motion matte."""
@@ -57,7 +57,6 @@ _MORE = {layer.name: layer for layer in FRAME_LAYERS if layer.part not in _PARTS
 _CHANNELS_OF = {"rgba": (4,), "splat": (4,), "grain": (3,)}
 ROWS = 64
 """Number of rows that are computed and written at a time."""
-_PLATE_STEPS = 256.0
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -186,7 +185,7 @@ def write_frozen_exr(
     layers = {"rgba": rgba, "depth": depth, "support": support, "motion": motion}
     names, formats = CHANNELS, _FORMATS
     if grain is not None:
-        layers["grain"] = grain
+        layers |= {"grain": grain, "alpha of the grain": np.broadcast_to(np.float32(0.0), tuple(np.shape(depth)))}
         names, formats = names + GRAIN_CHANNELS, formats + _GRAIN_FORMATS
     if detail is not None:
         layers |= {"splat": detail.splat, "plate": detail.plate, "source": detail.source}
@@ -196,10 +195,11 @@ def write_frozen_exr(
         layers[name] = layer
         names, formats = names + row.channels, formats + (_STORAGE[row.stored],) * len(row.channels)
     matrix = light_matrix(metadata.light)
-    parts = [_stored(name, layer, matrix) for name, layer in _checked(layers).items()]
-    spec = frame_spec(parts[0].shape[1], parts[0].shape[0], names, formats, metadata)
+    parts = {name: _in_primaries(name, layer, matrix) for name, layer in _checked(layers).items()}
+    height, width = parts["rgba"].shape[:2]
+    spec = frame_spec(width, height, names, formats, metadata)
     set_margin(spec, margin)
-    return write_exr(path, spec, parts)
+    return write_exr(path, spec, [*parts.values()], [*parts])
 
 
 def set_margin(spec: oiio.ImageSpec, margin: tuple[int, int]) -> None:
@@ -215,28 +215,32 @@ def set_margin(spec: oiio.ImageSpec, margin: tuple[int, int]) -> None:
     spec.full_width, spec.full_height = spec.width - 2 * across, spec.height - 2 * down
 
 
-def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[Rows]) -> Path:
-    """Writes layers [H,W,c] or [H,W], whose channels are those of `spec` in order, atomically.
+def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[Rows], names: Sequence[str] = ()) -> Path:
+    """Writes layers [H,W,c] or [H,W], whose channels are those of `spec` in order, atomically and ZIP-compressed.
 
     Half channels are clamped to +-65504. Rows are written in bands, because all layers of a 4K frame have half a
-    gigabyte. OSError with the system's reason, as `write_frozen_exr`.
+    gigabyte. Layers with `names` must be finite: ValueError names a bad one. OSError as `write_frozen_exr`.
     """
-    kinds = [spec.channelformat(channel).basetype for channel in range(spec.nchannels)]
-    most = np.array([HALF_MAX if kind == oiio.HALF else np.inf for kind in kinds], np.float32)
+    packing = Packing(spec, names or [""] * len(parts))
+    plain, header = packing.disguised()
 
     def rows(output: Any, top: int) -> bool:
-        values = _rows_of(parts, slice(top, min(top + ROWS, spec.height)), spec.width)
-        np.clip(values, -most, most, out=values)
+        of = slice(top, min(top + ROWS, spec.height))
+        with np.errstate(over="ignore"):
+            values = [np.asarray(part[of], np.float32) for part in parts]
+        packed, infinite = packing.packed(values)
+        for name in filter(None, infinite):
+            check_finite(name, values[list(names).index(name)], top)
         begin = spec.y + top
-        return bool(output.write_scanlines(begin, begin + len(values), 0, values))
+        return bool(output.write_scanlines(begin, begin + len(packed), 0, packed[..., None]))
 
-    return write_picture(path, spec, rows)
+    return write_picture(path, plain, rows, header)
 
 
-def write_picture(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bool]) -> Path:
+def write_picture(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bool], header: bytes = b"") -> Path:
     """Writes a picture atomically. `rows(output, top)` writes `ROWS` rows from row `top` and returns False on failure.
 
-    OSError with the system's reason, as `write_frozen_exr`.
+    `header` replaces the first bytes of the file. OSError with the system's reason, as `write_frozen_exr`.
     """
     with atomic_path(path) as partial:
         output = oiio.ImageOutput.create(str(partial))
@@ -251,13 +255,9 @@ def write_picture(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], b
             raise
         if not (good and output.close()):
             raise write_error(output.geterror(), path, spec.height * spec.width * 4 * spec.nchannels)
+        with open(partial, "rb+") as handle:
+            handle.write(header)
     return path
-
-
-def _rows_of(parts: Sequence[Rows], rows: slice, width: int) -> NDArray[np.float32]:
-    """[h,W,C] float32: some rows of all layers, concatenated along channels."""
-    height = rows.stop - rows.start
-    return np.concatenate([part[rows].reshape(height, width, -1) for part in parts], axis=2, dtype=np.float32)
 
 
 def channel_names(spec: oiio.ImageSpec) -> list[str]:
@@ -342,45 +342,15 @@ def read_key(path: str | Path) -> str | None:
         image.close()
 
 
-def _coarse(grain: NDArray[Any]) -> NDArray[np.float16]:
-    """Grain [h,W,3] as half floats whose eight lowest bits are 0, plus an alpha of 0: [h,W,4]."""
-    half = np.clip(grain, -HALF_MAX, HALF_MAX).astype(np.float16)
-    # Rounded to nearest, because truncation would reduce the grain by a tenth.
-    half = ((half.view(np.uint16) + np.uint16(0x80)) & np.uint16(0xFF00)).view(np.float16)
-    return np.concatenate([half, np.zeros((*half.shape[:2], 1), np.float16)], axis=2)
-
-
-def _eight_bits(values: NDArray[np.float32]) -> NDArray[np.float16]:
-    """Values as half floats with 8 bits of mantissa, rounded to nearest."""
-    bits = np.clip(values, -HALF_MAX, HALF_MAX).view(np.uint32)
-    return ((bits + np.uint32(0x4000)) & np.uint32(0xFFFF8000)).view(np.float32).clip(-HALF_MAX, HALF_MAX).astype("f2")
-
-
-def _in_steps(plate: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.round(plate * _PLATE_STEPS) / _PLATE_STEPS
-
-
-_STORED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
-    "grain": _coarse,
-    "splat": _eight_bits,
-    "plate": _in_steps,
-}
-"""Name of a layer -> rounding of its rows before they are written."""
-
-
-def _stored(name: str, layer: Rows, matrix: NDArray[np.float32] | None) -> Rows:
-    """A layer as stored in the file: colours converted by `matrix` to the file's primaries, then rounded."""
-    change = _STORED.get(name, lambda rows: rows)
+def _in_primaries(name: str, layer: Rows, matrix: NDArray[np.float32] | None) -> Rows:
+    """A layer as stored in the file: colours converted by `matrix` to the file's primaries."""
     if matrix is not None and len(layer.shape) == 3 and (name not in _MORE or _MORE[name].is_colour):
-        return LazyLayer(layer.shape, lambda rows: change(in_light(layer[rows], matrix)))
-    return LazyLayer(layer.shape, lambda rows: change(layer[rows])) if name in _STORED else layer
+        return LazyLayer(layer.shape, lambda rows: in_light(layer[rows], matrix))
+    return layer
 
 
 def _checked(layers: dict[str, ArrayLike | LazyLayer]) -> dict[str, Rows]:
-    """The layers as float32, after checks of shape and finite values. ValueError names a bad layer.
-
-    All layers must have the size of `rgba`. Values of `LazyLayer` layers are checked when they are computed.
-    """
+    """The layers as float32. ValueError names a layer that has not the size of `rgba`."""
     with np.errstate(over="ignore"):
         found: dict[str, Rows] = {
             name: layer if isinstance(layer, LazyLayer) else np.asarray(layer, dtype=np.float32)
@@ -394,19 +364,7 @@ def _checked(layers: dict[str, ArrayLike | LazyLayer]) -> dict[str, Rows]:
         expected = (*colour[:2], *_CHANNELS_OF.get(name, (colours,) if colours > 1 else ()))
         if tuple(layer.shape) != expected:
             raise ValueError(f"{name} should be {list(expected)} like rgba, got shape {list(layer.shape)}")
-        if isinstance(layer, LazyLayer):
-            found[name] = LazyLayer(layer.shape, functools.partial(_computed_rows, name, layer))
-        elif isinstance(layer, np.ndarray):
-            check_finite(name, cast(NDArray[Any], layer))
     return found
-
-
-def _computed_rows(name: str, layer: LazyLayer, rows: slice) -> NDArray[np.float32]:
-    """Some rows of a layer, float32. ValueError if a value is not finite."""
-    with np.errstate(over="ignore"):
-        values = np.asarray(layer[rows], dtype=np.float32)
-    check_finite(name, values, rows.start)
-    return values
 
 
 def check_finite(name: str, layer: NDArray[np.float32], top: int = 0) -> None:

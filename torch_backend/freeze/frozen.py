@@ -63,7 +63,7 @@ class FrozenImage:
     """[H, W] standard deviation of `depth` in scene units; None: unknown, `depth` is that of the splats."""
 
     def cpu(self) -> FrozenImage:
-        """A copy on the CPU, for writing files."""
+        """The frame on the CPU, for writing files; tensors that are there already are not copied."""
         return replace(self, **{name: value.cpu() for name, value in vars(self).items() if value is not None})
 
 
@@ -124,7 +124,7 @@ def render_frozen(
     exposed_at: float = 0.0,
     overscan: tuple[float, float] = (0.0, 0.0),
 ) -> FrozenImage:
-    """Renders one view of a frozen scene, on the CPU: viewmat [4, 4] in scene units, K [3, 3] in pixels.
+    """Renders one view of a frozen scene, on its device: viewmat [4, 4] in scene units, K [3, 3] in pixels.
 
     `exposure` at the normalised time `exposed_at` is applied, so that the frame matches the plate it is mixed with.
     Time is frozen for the scene, not for the camera's exposure. None: colours of the Gaussians. `overscan`: pixels
@@ -150,14 +150,11 @@ def render_frozen(
     parts = bands(height, width)
     if len(parts) == 1:
         color, alpha, support, motion = _separated(colors, alphas, exposure, exposed_at)
-        return FrozenImage(color, alpha, depth, support, motion).cpu()
+        return FrozenImage(color, alpha, depth, support, motion)
     image = FrozenImage(
-        torch.empty(height, width, 3, device="cpu"),
-        torch.empty(height, width, device="cpu"),
-        depth.cpu(),
-        torch.empty(height, width, device="cpu"),
-        torch.empty(height, width, device="cpu"),
-    )
+        torch.empty(height, width, 3, device=depth.device), torch.empty_like(depth), depth,
+        torch.empty_like(depth), torch.empty_like(depth),
+    )  # fmt: skip
     for rows in parts:
         color, alpha, support, motion = _separated(colors[rows], alphas[rows], exposure, exposed_at)
         image.color[rows], image.alpha[rows] = color, alpha

@@ -11,6 +11,8 @@ third it is blended with another picture. At the sizes 56 and 42, pixel centres 
 detail_ap1/ holds frame 6 and its warp again, as written for ACEScg footage.
 """
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,8 @@ import numpy as np
 WIDTH, HEIGHT = 56, 42
 FRAMES = (5, 6)
 FOLDER = Path(__file__).with_name("detail")
+PROBE = (0.78125, 0.390625, 0.1953125)
+"""What a take's facts state of linear footage: the light that its probe colour stands for."""
 
 
 def plate(frame: int) -> np.ndarray:
@@ -76,6 +80,25 @@ def frozen(frame: int) -> np.ndarray:
 def source(frame: int) -> np.ndarray:
     """[H, W] float32: frame numbers that a half float cannot represent."""
     return np.where(matte(frame) > 0, 100_001.0 + frame, 0.0).astype(np.float32)
+
+
+def add_take(shot: Path, **footage: object) -> Path:
+    """Add the take `detail` of these frames to a shot, with facts of the footage in take.json; return its folder."""
+    take = shot / "takes" / "detail"
+    shutil.copytree(FOLDER, take, ignore=shutil.ignore_patterns("plate"))
+    write_facts(take, **footage)
+    return take
+
+
+def write_facts(take: Path, **footage: object) -> None:
+    """Write take.json of the take `detail`, by default of the linear plates in detail/plate/."""
+    facts = {"version": 1, "take": "detail", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 2}
+    facts |= {"width": WIDTH, "height": HEIGHT, "first": 5, "last": 6, "camera_path": ""}
+    if footage:
+        of = {"file": str(FOLDER / "plate" / "000005.exr"), "beside": "", "size": [WIDTH, HEIGHT], "first": 5}
+        of |= {"last": 6, "probe": list(PROBE), "space": "linear, Rec.709", "map": "", "unlike": ""}
+        facts["footage"] = of | footage
+    (take / "take.json").write_text(json.dumps(facts))
 
 
 def main() -> None:

@@ -16,17 +16,21 @@ make_frames = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(make_frames)
 
 
-def write_png(path: Path, rgb: np.ndarray) -> None:
-    """Write 8-bit RGB [H, W, 3] uint8 as a PNG, without Blender or the backend."""
-    height, width, _ = rgb.shape
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), rgb.reshape(height, width * 3)], axis=1)
+def png(pixels: np.ndarray) -> bytes:
+    """Encode [H, W] or [H, W, C] uint8 as a PNG, without Blender or the backend."""
+    height, width, channels = (*pixels.shape, 1)[:3]
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 8, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
     body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    path.write_bytes(png(pixels))
 
 
 def rotation(axis: tuple[float, float, float], angle: float) -> np.ndarray:

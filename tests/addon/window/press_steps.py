@@ -47,12 +47,18 @@ def main() -> int:
     return 0 if results.get("ended") == [name for name, _ in STEPS] else 1
 
 
-def _host(script: str, plan: dict, args: argparse.Namespace) -> dict:
-    """Run a script in Blender on a display and take the pictures that it requests; print and return its results."""
+def _host(
+    script: str, plan: dict, args: argparse.Namespace, prepare: Callable[[Path], dict[str, str]] | None = None
+) -> dict:
+    """Run a script in Blender on a display and take the pictures that it requests; print and return its results.
+
+    `prepare` fills the work folder, and returns the environment of Blender.
+    """
     output = Path(args.output).absolute()
     output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="splannequin-window-") as work:
-        environ = {**os.environ, "DISPLAY": args.display, PLAN: json.dumps({**plan, "work": work})}
+        environ = dict(os.environ) if prepare is None else prepare(Path(work))
+        environ |= {"DISPLAY": args.display, PLAN: json.dumps({**plan, "work": work})}
         with screen(args.display):
             blender = subprocess.Popen(command(args.blender, script), env=environ)
             _serve(blender, Path(work), output, environ, args.limit)

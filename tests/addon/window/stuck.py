@@ -17,7 +17,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,7 +26,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import press_steps as press
 
-PLAN = "SPLANNEQUIN_STUCK_PLAN"
 ROOT = Path(__file__).resolve().parents[3]
 WORLD = "from pathlib import Path; from tests.backend.conftest import build_world; build_world(Path({!r}))"
 CHECKS = {
@@ -46,28 +44,21 @@ def main() -> int:
     parser.add_argument("--display", default=":93")
     parser.add_argument("--limit", type=float, default=900.0)
     args = parser.parse_args()
-    output = Path(args.output).absolute()
-    output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="splannequin-stuck-") as name:
-        work = Path(name)
-        _prepare(work, args.backend)
+
+    def prepare(work: Path) -> dict[str, str]:
+        _write_projects(work, args.backend)
         environ = {k: v for k, v in os.environ.items() if not k.startswith("SPLANNEQUIN_")}
-        environ |= {"HOME": str(work / "home"), "DISPLAY": args.display}
+        environ["HOME"] = str(work / "home")
         _install(args.blender, work, environ)
-        plan = {"work": name, "backend": args.backend}
-        with press.screen(args.display):
-            command = press.command(args.blender, __file__)
-            blender = subprocess.Popen(command, env={**environ, PLAN: json.dumps(plan)})
-            press._serve(blender, work, output, environ, args.limit)
-        results_file = work / "told.json"
-        results = json.loads(results_file.read_text()) if results_file.is_file() else {"error": "Blender told nothing"}
-    print(json.dumps(results, indent=1))
+        return environ
+
+    results = press._host(__file__, {"backend": args.backend}, args, prepare)
     lacking = sorted(name for name in CHECKS if results.get(name) is not True)
     print("did not hold: " + ", ".join(lacking) if lacking else "all of it held")
     return 1 if lacking or "error" in results else 0
 
 
-def _prepare(work: Path, backend: str) -> None:
+def _write_projects(work: Path, backend: str) -> None:
     """Write a project with a clip to import, and one with a solved and trained shot."""
     (work / "home").mkdir()
     (work / "clip").mkdir()
@@ -90,15 +81,6 @@ def _install(blender: str, work: Path, environ: dict[str, str]) -> None:
 
 
 # ------------------------------------------------------------------------------------------------- inside Blender
-
-
-def inside() -> None:
-    """Start the script as a timer."""
-    import bpy
-
-    plan = json.loads(os.environ[PLAN])
-    results: dict[str, Any] = {"blender": bpy.app.version_string}
-    press.act(_play(plan, results), Path(plan["work"]), results)
 
 
 def _play(plan: dict[str, Any], results: dict[str, Any]) -> Iterator[float]:
@@ -320,7 +302,11 @@ def _until(condition: Callable[[], Any], seconds: float, what: str) -> Iterator[
 
 
 if __name__ == "__main__":
-    if PLAN in os.environ and "bpy" in sys.modules:
-        inside()
+    if press.PLAN in os.environ and "bpy" in sys.modules:
+        import bpy
+
+        plan = json.loads(os.environ[press.PLAN])
+        results: dict[str, Any] = {"blender": bpy.app.version_string}
+        press.act(_play(plan, results), Path(plan["work"]), results)
     else:
         sys.exit(main())

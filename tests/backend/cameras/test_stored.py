@@ -49,6 +49,8 @@ def edited(edit):
     [
         ("points.npz", cut),
         ("points.npz", lambda path: path.write_bytes(b"")),
+        ("points.npz", lambda path: path.write_bytes(bytes(range(256)) * 9)),
+        ("points.npz", with_points(xyz=np.zeros((5, 3), np.float32))),
         ("points.npz", with_points(rgb=None)),
         ("points.npz", with_points(xyz=np.zeros((4, 2), np.float32))),
         ("points.npz", with_points(xyz=np.array(1.0, np.float32))),
@@ -79,7 +81,13 @@ def test_a_damaged_solve_json_is_named(shot):
 
 @pytest.mark.parametrize(
     "damage",
-    [cut, edited(lambda data: data.pop("frames")), edited(lambda data: data["frames"][1].pop("seconds"))],
+    [
+        cut,
+        lambda path: path.write_text("[" * 200_000),
+        edited(lambda data: data.pop("frames")),
+        edited(lambda data: data.update(frames=[3])),
+        edited(lambda data: data["frames"][1].pop("seconds")),
+    ],
 )
 def test_a_damaged_listing_of_frames_is_named_and_importing_again_is_the_advice(shot, damage):
     damage(shot.frames / "frames.json")
@@ -125,7 +133,7 @@ def test_damaged_frame_is_detected_before_the_solve_and_reimported(solved, again
     cut(shot.frames / "raw/000107.png")
     (shot.frames / "raw/000109.png").unlink()
     with pytest.raises(JobError) as error:
-        solve_shot(shot, SolveConfig(features=1000), tools.recorder(cancel_at="solve: features"))
+        solve_shot(shot, SolveConfig(features=1000), tools.recorder(cancel_at=("solve: features", 0.0)))
     assert error.value.message == f"Damaged or missing in {shot.frames / 'raw'}: frames 107, 109."
     assert (error.value.hint, error.value.exit_code) == ("Import the clip again.", ExitCode.FOOTAGE)
     import_footage(shot, solved.shot.info().source, FootageConfig(step=2), tools.recorder())

@@ -77,3 +77,10 @@ def test_a_card_is_tested_before_its_first_use(walk):
     assert {"raster_project_backward", "ssim_pass", "adam", *planes} <= set(results["launched"])
     assert "an illegal memory access" in results["broken"] and "see the log" not in results["broken"]
     assert results["full"] == ["its memory is taken by other programs", False]
+
+
+def test_a_frame_is_composited_on_a_card_as_on_the_processor(walk):
+    results = walk("composited")
+    assert results["devices"] == ["cuda"] and results["filled"] > 0.5
+    assert max(results["error"].values()) < 5e-4
+    assert sum(results["waits"].values()) <= 40, results["waits"]

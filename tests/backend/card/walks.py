@@ -191,6 +191,46 @@ def station(folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def composited(folder: Path) -> dict[str, Any]:
+    """A frozen frame of plates on the card and on the processor: errors, and synchronisations on the card."""
+    import torch
+
+    from torch_backend.contract import TrainParams
+    from torch_backend.footage.plates import Plates
+    from torch_backend.freeze.composite.compositor import Compositor
+    from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen
+    from torch_backend.scene import load_scene
+    from torch_backend.train import load_run, train_shot
+
+    world, quiet = small_world(folder)
+    train_shot(world.shot, TrainParams(run="g", iterations=10, max_gaussians=260, device="cpu", holdout=0), quiet())
+    scene, plates = load_scene(world.shot), Plates(world.shot)
+    K, (t_star, frame) = scene.camera_at(plates.width, plates.height)[6], (scene.frames[1], scene.frames[6])
+    output = OutputFrame(frame, scene.viewmats[6], K, float(t_star), float(frame))
+
+    def made(device: str) -> Any:
+        run = load_run(world.shot, "g", torch.device(device))
+        frozen, exposure = freeze_at(run.model, scene.time_of_frame(t_star), 1.0), run.model.exposure
+        compositor, size = Compositor(run, scene, plates), (plates.width, plates.height)
+        for _ in range(2):  # the second frame finds all plates in the cache
+            image = render_frozen(frozen, output.viewmat, K, *size, exposure, scene.time_of_frame(frame))
+            CARD.waits.clear()
+            result = compositor.frame(output, frozen, image, *size, (frame,))
+            waits = dict(CARD.waits)
+        return result, waits
+
+    expected, _ = made("cpu")
+    with pretended_card():
+        found, waits = made("cuda")
+        devices = sorted({value.device.type for value in vars(found).values() if isinstance(value, torch.Tensor)})
+        found = found.cpu()
+    error = {
+        name: float((getattr(found, name) - getattr(expected, name)).abs().max())
+        for name in ("linear", "alpha", "plate", "support", "motion", "matte", "fill")
+    }
+    return {"devices": devices, "error": error, "waits": waits, "filled": float(expected.plate.mean())}
+
+
 def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
     """Bytes of a step per Gaussian, compared with the memory model. All Gaussians move, except with `static`."""
     import torch
@@ -244,7 +284,7 @@ def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
         before = len(trainer.model.gaussians)
         train_to_end(trainer, folder / "c.safetensors", lambda _: None)
         saved = (folder / "c.safetensors").is_file()
-    warnings = [event[1] for event in trainer.report.events if event[0] == "warning"]
+    warnings = trainer.report.warnings
     means = trainer.model.gaussians.params["means"]
     return {
         "iteration": trainer.iteration, "before": before, "after": len(trainer.model.gaussians), "saved": saved,
@@ -265,7 +305,7 @@ def bad_frames(folder: Path) -> dict[str, Any]:
             trainer.step()
         trainer.inspect_nonfinite()
         changed = [name for name, p in trainer.model.gaussians.params.items() if not bool((before[name] == p).all())]
-        warnings = [event[1] for event in trainer.report.events if event[0] == "warning"]
+        warnings = trainer.report.warnings
         for _ in range(12):
             trainer.step()
         try:
@@ -301,6 +341,7 @@ def self_test(folder: Path) -> dict[str, Any]:
 WALKS = {
     "steps": steps, "recorded": recorded, "launches": launches, "resume": resume, "station": station,
     "step_bytes": step_bytes, "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test,
+    "composited": composited,
 }  # fmt: skip
 
 if __name__ == "__main__":

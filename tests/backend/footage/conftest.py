@@ -7,30 +7,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from torch_backend.contract import Cancelled, Reporter
-
-
-class Recorder(Reporter):
-    """Records events; cancels after `cancel_after` checks."""
-
-    def __init__(self, cancel_after=None):
-        self.warnings, self.steps, self.checks, self.cancel_after = [], [], 0, cancel_after
-
-    def progress(self, stage, done, total, message=""):
-        self.steps.append((stage, done, total))
-
-    def warning(self, message, hint=""):
-        self.warnings.append(message)
-
-    def check_cancelled(self):
-        self.checks += 1
-        if self.cancel_after is not None and self.checks > self.cancel_after:
-            raise Cancelled
+from tests.backend.quiet import Quiet
 
 
 @pytest.fixture
 def recorder():
-    return Recorder
+    return Quiet
 
 
 @pytest.fixture

@@ -3,9 +3,9 @@
 import json
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 
+from tests.backend.pictures import write
 from torch_backend.contract import JobError
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.color import linear_to_srgb, srgb_to_linear
@@ -80,9 +80,7 @@ def test_an_exr_of_lamps_is_imported_with_them(tmp_path, recorder):
     for n in range(9):
         picture = np.ascontiguousarray(wall[:, 4 * n : 4 * n + 64]).astype(np.float16)
         picture[8:16, 30:40], picture[30, 30], picture[2, 2] = 50.0, -0.5, 1000.0
-        out = oiio.ImageOutput.create(str(tmp_path / f"a.{n}.exr"))
-        assert out.open(str(tmp_path / f"a.{n}.exr"), oiio.ImageSpec(64, 48, 3, "half")) and out.write_image(picture)
-        assert out.close()
+        write(tmp_path / f"a.{n}.exr", picture)
     shot, report = Shot.create(tmp_path / "a.splannequin"), recorder()
     import_footage(shot, str(tmp_path), FootageConfig(), report)
     record = json.loads(shot.listing.read_text())
@@ -98,9 +96,7 @@ def test_an_exr_of_lamps_is_imported_with_them(tmp_path, recorder):
 def test_finished_import_of_an_older_version_is_kept(tmp_path, recorder):
     wall = np.random.default_rng(0).uniform(0.1, 0.9, (48, 100, 3)).astype(np.float16)
     for n in range(9):
-        out = oiio.ImageOutput.create(str(tmp_path / f"a.{n}.exr"))
-        assert out.open(str(tmp_path / f"a.{n}.exr"), oiio.ImageSpec(64, 48, 3, "half"))
-        assert out.write_image(np.ascontiguousarray(wall[:, 4 * n : 4 * n + 64])) and out.close()
+        write(tmp_path / f"a.{n}.exr", wall[:, 4 * n : 4 * n + 64])
     shot, config = Shot.create(tmp_path / "a.splannequin"), FootageConfig()
     import_footage(shot, str(tmp_path), config, recorder())
     record = json.loads(shot.listing.read_text())

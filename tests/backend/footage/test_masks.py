@@ -89,16 +89,6 @@ def test_mask_video_is_matched_by_frame_count(shot, recorder, tmp_path, write_vi
     assert all((mask.of(frame) == np.roll(COVERED, frame - 101, axis=1)).all() for frame in FRAMES)
 
 
-def test_transparent_footage_pixels_are_not_covered(shot, recorder, tmp_path):
-    write_rgba(tmp_path / "logo.png", np.full((48, 64, 3), 255, np.uint8), np.where(COVERED, 255, 0).astype(np.uint8))
-    assert (masks_of(shot, recorder, ignore=tmp_path / "logo.png")["ignore"].of(105) == COVERED).all()
-
-
-def test_a_matte_in_the_alpha_of_black_pictures_is_one(shot, recorder, tmp_path):
-    write_rgba(tmp_path / "logo.png", np.zeros((48, 64, 3), np.uint8), np.where(COVERED, 255, 0).astype(np.uint8))
-    assert (masks_of(shot, recorder, ignore=tmp_path / "logo.png")["ignore"].of(105) == COVERED).all()
-
-
 def test_the_footage_s_alpha_ignores_what_is_transparent_and_lets_move_what_is_opaque(tmp_path, pan, recorder):
     (tmp_path / "clip").mkdir()
     for number, pixels in zip(FRAMES, pan(10), strict=True):

@@ -3,10 +3,10 @@
 import json
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 
 from tests.backend.footage.test_plates import solved
+from tests.backend.pictures import write
 from torch_backend.cameras import imported
 from torch_backend.contract import MASK_ALPHA, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
@@ -107,11 +107,7 @@ def test_footage_alpha_belongs_to_the_same_frame(tmp_path, pictures, recorder):
     for n, pixels in enumerate(pictures, 1):
         alpha = np.full((96, 128, 1), 255, np.uint8)
         alpha[: 4 * n] = 0
-        out = oiio.ImageOutput.create(str(folder / f"a.{n:04d}.png"))
-        spec = oiio.ImageSpec(128, 96, 4, "uint8")
-        spec.attribute("oiio:UnassociatedAlpha", 1)
-        assert out.open(str(folder / f"a.{n:04d}.png"), spec)
-        assert out.write_image(np.concatenate([pixels, alpha], 2)) and out.close()
+        write(folder / f"a.{n:04d}.png", np.concatenate([pixels, alpha], 2), oiio__UnassociatedAlpha=1)
     shot = Shot.create(tmp_path / "a.splannequin")
     import_footage(shot, str(folder), FootageConfig(start=1001), recorder())
     mask = read_masks(shot, {"ignore": MASK_ALPHA}, recorder())["ignore"]

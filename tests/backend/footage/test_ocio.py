@@ -8,6 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from tests.backend.pictures import write
 from torch_backend.contract import ExitCode, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.color import PRIMARIES, InputSpace, hlg_to_linear, pq_to_linear
@@ -64,14 +65,10 @@ def relative_error(found, expected):
     return float((np.abs(found - expected).max(-1) / np.abs(expected).max(-1)).max())
 
 
-def written(folder, pixels, name="a", kind="float", **attributes):
+def written(folder, pixels, name="a", **attributes):
     folder.mkdir(exist_ok=True)
     for number in range(1, 4):
-        spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, kind)
-        for key, value in attributes.items():
-            spec.attribute(key.replace("__", ":"), value)
-        out = oiio.ImageOutput.create(str(folder / f"{name}.{number}.exr"))
-        assert out.open(str(folder / f"{name}.{number}.exr"), spec) and out.write_image(pixels) and out.close()
+        write(folder / f"{name}.{number}.exr", pixels, **attributes)
     return folder
 
 
@@ -202,10 +199,7 @@ def test_plates_keep_to_the_configuration_of_the_import(tmp_path, monkeypatch, r
     config.write_text(CONFIG.format(interchange="", alias="lin_rec709"))
     folder.mkdir()
     for number, picture in enumerate(pan(9), start=1):
-        out = oiio.ImageOutput.create(str(folder / f"a.{number}.exr"))
-        spec = oiio.ImageSpec(64, 48, 3, "half")
-        assert out.open(str(folder / f"a.{number}.exr"), spec)
-        assert out.write_image((picture / 160.0).astype(np.float32)) and out.close()
+        write(folder / f"a.{number}.exr", (picture / 160.0).astype(np.float16))
     monkeypatch.setenv("OCIO", str(config))
     shot = Shot.create(tmp_path / "a.splannequin")
     import_footage(shot, str(folder), FootageConfig(colour_space="Halved"), recorder())

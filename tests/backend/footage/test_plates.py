@@ -4,10 +4,10 @@ import os
 from fractions import Fraction
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from tests.backend.pictures import write
 from torch_backend.contract import CameraFrame, CameraPath, JobError, frame_file, read_json
 from torch_backend.footage import FootageConfig, import_footage, load_frames, plate_encoding
 from torch_backend.footage.display import ROLLED, display_of
@@ -53,14 +53,7 @@ def shot_of(tmp_path, recorder):
 def write_sequence(folder, pictures, suffix="png"):
     folder.mkdir()
     for n, pixels in enumerate(pictures, start=1001):
-        path = str(folder / f"a.{n}.{suffix}")
-        if suffix == "png":
-            write_png(path, pixels)
-            continue
-        out = oiio.ImageOutput.create(path)
-        kind = {"float16": "half", "float32": "float"}[str(pixels.dtype)]
-        assert out.open(path, oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, kind))
-        assert out.write_image(pixels) and out.close()
+        (write_png if suffix == "png" else write)(folder / f"a.{n}.{suffix}", pixels)
     return folder
 
 

@@ -5,29 +5,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from tests.backend.pictures import spec_of, write
 from torch_backend.contract import ExitCode, JobError
 from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.opening import open_source
-
-
-def spec_of(pixels, names=None, window=None, full=None, **attributes):
-    kind = {"float16": "half", "float32": "float"}.get(str(pixels.dtype), str(pixels.dtype))
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    if names:
-        spec.channelnames = names
-    if full:
-        spec.full_x, spec.full_y, spec.full_width, spec.full_height = full
-        spec.x, spec.y = window
-    for name, value in attributes.items():
-        name = name.replace("__", ":")
-        spec.attribute(name, f"float[{len(value)}]", value) if isinstance(value, tuple) else spec.attribute(name, value)
-    return spec
-
-
-def write(path, pixels, names=None, window=None, full=None, **attributes):
-    spec = spec_of(pixels, names, window, full, **attributes)
-    out = oiio.ImageOutput.create(str(path))
-    assert out and out.open(str(path), spec) and out.write_image(pixels) and out.close(), oiio.geterror()
 
 
 def write_parts(path, parts):
@@ -312,14 +293,6 @@ def test_pictures_of_two_sizes_are_refused(exrs):
     write(exrs / "shot.1006.exr", np.zeros((20, 30, 3), np.float16))
     with pytest.raises(JobError, match=r"shot\.1006\.exr is 30x20, but the sequence starts with 64x48\."):
         list(open_source(str(exrs)).frames(None, None))
-
-
-def test_a_folder_of_two_sequences_asks_which(exrs):
-    for i in range(3):
-        write(exrs / f"other.{i}.png", np.zeros((8, 8, 3), np.uint8))
-    with pytest.raises(JobError, match="contains 2 image sequences"):
-        open_source(str(exrs))
-    assert open_source(str(exrs / "other.1.png")).info.last == 2
 
 
 @pytest.mark.parametrize("name", ["", "single.png", "none.####.exr", "gone.png", "gone.mp4"])

@@ -6,7 +6,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from tests.backend.footage.test_sequence import first_of, flat, said, spec_of, write
+from tests.backend.footage.test_sequence import first_of, flat, said
+from tests.backend.pictures import write
 from torch_backend.footage.opening import open_source
 
 WHITE = {"D65": (0.3127, 0.3290), "ACES": (0.32168, 0.33767)}
@@ -103,10 +104,7 @@ def test_unapplied_colour_profile_is_reported(tmp_path, name, words):
     content = np.frombuffer(profile(name), np.uint8)
     pixels = flat(200, 100, 50, kind=np.uint8)
     for i in range(3):
-        spec = spec_of(pixels)
-        spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{content.size}]"), content)
-        out = oiio.ImageOutput.create(str(tmp_path / f"a.{i}.png"))
-        assert out.open(str(tmp_path / f"a.{i}.png"), spec) and out.write_image(pixels) and out.close()
+        write(tmp_path / f"a.{i}.png", pixels, ICCProfile=(oiio.TypeDesc(f"uint8[{content.size}]"), content))
     warnings = [f"The pictures carry the colour profile {name!r}, which is not applied."]
     assert said(first_of(tmp_path)[0]) == (warnings if words else [])
 

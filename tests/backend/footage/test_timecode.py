@@ -7,6 +7,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from tests.backend.pictures import write
 from torch_backend.contract.timecode import later, parse_timecode, smpte_bits
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.opening import open_source
@@ -76,13 +77,9 @@ def with_timecode(tmp_path, pan):
         folder = tmp_path / f"{suffix}{len(code)}"
         folder.mkdir()
         for n, picture in enumerate(pan(10)):
-            spec = oiio.ImageSpec(64, 48, 3, "half" if suffix == "exr" else "uint8")
-            if code:
-                spec.attribute("smpte:TimeCode", oiio.TypeDesc("timecode"), smpte_bits(later(code, n, 24)))
-            file = str(folder / f"a.{1001 + n}.{suffix}")
-            out = oiio.ImageOutput.create(file)
-            assert out.open(file, spec) and out.write_image((picture / np.float32(255)).astype(np.float32))
-            out.close()
+            pixels = (picture / np.float32(255)).astype(np.float16) if suffix == "exr" else picture
+            bits = (oiio.TypeDesc("timecode"), smpte_bits(later(code, n, 24))) if code else None
+            write(folder / f"a.{1001 + n}.{suffix}", pixels, **({"smpte__TimeCode": bits} if bits else {}))
         return folder
 
     return make

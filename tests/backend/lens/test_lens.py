@@ -36,9 +36,11 @@ LENSES = {
 }
 
 
-@pytest.fixture(scope="module")
-def colmap(tmp_path_factory):
-    """By lens: the worker's pinhole and map, the model's parameters, points of the original and their rays."""
+def of_colmap(folder: Path, lenses: dict) -> dict[str, dict]:
+    """By lens: the worker's pinhole and map, the model's parameters, points of the original and their rays.
+
+    They are of a separate process, because pycolmap cannot be loaded with OpenImageIO.
+    """
     code = (
         "import json, sys, numpy as np, pycolmap\n"
         "from torch_backend.sfm.answers import undistortion\n"
@@ -51,9 +53,13 @@ def colmap(tmp_path_factory):
         "             rays=np.asarray(camera.cam_from_img(points)), focal=camera.mean_focal_length(),\n"
         "             extra=[float(camera.params[i]) for i in camera.extra_params_idxs()])\n"
     )
-    folder = tmp_path_factory.mktemp("lenses")
-    subprocess.run([sys.executable, "-c", code, str(folder), json.dumps(LENSES)], check=True, cwd=ROOT)
-    return {name: dict(np.load(folder / f"{name}.npz", allow_pickle=False)) for name in LENSES}
+    subprocess.run([sys.executable, "-c", code, str(folder), json.dumps(lenses)], check=True, cwd=ROOT)
+    return {name: dict(np.load(folder / f"{name}.npz", allow_pickle=False)) for name in lenses}
+
+
+@pytest.fixture(scope="module")
+def colmap(tmp_path_factory):
+    return of_colmap(tmp_path_factory.mktemp("lenses"), LENSES)
 
 
 def solved(folder: Path, model: str, extra, focal: float, K, width=WIDTH, height=HEIGHT, **facts) -> Shot:

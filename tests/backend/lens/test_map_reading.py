@@ -4,6 +4,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from tests.backend.pictures import write
 from torch_backend.contract import ExitCode, JobError
 from torch_backend.footage.oiio_types import open_output
 from torch_backend.lens.lens import Lens
@@ -138,12 +139,8 @@ def test_invalid_map_areas_are_ignored(tmp_path):
         lens, _ = read(path)
         assert error_px(lens, 0.2) < 2e-3, name
     rgb = np.concatenate([st, inside.astype(float)], -1)
-    spec = oiio.ImageSpec(*rgb.shape[1::-1], 3, oiio.FLOAT)
-    spec.channelnames = ("R", "G", "A")
     rgb[..., :2][~inside[..., 0]] = 0.7
-    output = oiio.ImageOutput.create(str(tmp_path / "c.exr"))
-    assert open_output(output, tmp_path / "c.exr", spec)
-    assert output.write_image(rgb.astype(np.float32)) and output.close()
+    write(tmp_path / "c.exr", rgb.astype(np.float32), ("R", "G", "A"))
     assert error_px(read(str(tmp_path / "c.exr"))[0], 0.2) < 2e-3
 
 

@@ -1,19 +1,13 @@
 """Undistortion: sampling compared with pictures defined by a formula, the map compared with the lens model."""
 
-import json
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from tests.backend.lens.test_lens import of_colmap
 from torch_backend.cameras import imported
 from torch_backend.footage.display import PLAIN, ROLLED
 from torch_backend.lens.plate_lens import PlateLens
 from torch_backend.lens.undistort import BandUndistorter, Undistorter, of_frames
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def identity(height, width):
@@ -75,24 +69,9 @@ LENSES = {
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory):
-    """The worker's maps for 160x120 lenses, from a separate process: pycolmap cannot be loaded with OpenImageIO."""
-    code = (
-        "import json, sys, numpy as np, pycolmap\n"
-        "from torch_backend.sfm.answers import undistortion\n"
-        "for name, (model, params) in json.loads(sys.argv[2]).items():\n"
-        "    camera = pycolmap.Camera.create_from_model_name(1, model, 100.0, 160, 120)\n"
-        "    camera.params = params\n"
-        "    pinhole, where = undistortion(camera)\n"
-        "    np.savez(f'{sys.argv[1]}/{name}.npz', pinhole=pinhole, where=where)\n"
-    )
-    folder = tmp_path_factory.mktemp("maps")
-    subprocess.run([sys.executable, "-c", code, str(folder), json.dumps(LENSES)], check=True, cwd=ROOT)
-
-    def load(name):
-        with np.load(folder / f"{name}.npz", allow_pickle=False) as data:
-            return data["pinhole"], data["where"]
-
-    return load
+    """maps(name): the worker's pinhole and map of a lens."""
+    found = of_colmap(tmp_path_factory.mktemp("maps"), LENSES)
+    return lambda name: (found[name]["pinhole"], found[name]["where"])
 
 
 def assert_no_blank_pixels(where):
@@ -114,10 +93,6 @@ def test_the_map_is_the_lens_model_without_blank_pixels(maps, name):
     gaps = [where[..., 0].min() - 0.5, where[..., 1].min() - 0.5]
     gaps += [159.5 - where[..., 0].max(), 119.5 - where[..., 1].max()]
     assert min(gaps) < 2e-3
-
-
-def test_undistorted_lens_changes_nothing(maps):
-    assert np.allclose(maps("none")[1], identity(120, 160), atol=1e-3)
 
 
 def test_a_tangential_lens_keeps_its_pixel_aspect(maps):
@@ -167,26 +142,6 @@ def test_row_bands_do_not_change_the_result_at_any_size():
     assert (same == picture).all()
     part = BandUndistorter(identity(20, 10) + np.float32([5, 40]))
     assert (part(picture, lambda x: x, lambda x: x, np.empty((20, 10, 3), np.float32)) == picture[40:60, 5:15]).all()
-
-
-@pytest.mark.parametrize("name", ["barrel", "pincushion"])
-def test_distort_and_undistort_cancel(maps, name):
-    """A smooth picture that is distorted by the lens and undistorted equals the picture without the lens."""
-
-    def scene(x, y):
-        return 30000 + 20000 * np.sin(7.0 * x) * np.cos(6.0 * y)
-
-    pinhole, where = maps(name)
-    k = LENSES[name][1][3]
-    distorted = (identity(120, 160) - [82.0, 57.0]) / 140.0
-    ideal = distorted.copy()
-    for _ in range(60):
-        ideal = distorted / (1 + k * (ideal**2).sum(-1, keepdims=True))
-    seen = np.repeat(scene(ideal[..., 0], ideal[..., 1])[..., None], 3, axis=2).astype(np.uint16)
-    plain = (identity(120, 160) - pinhole[2:]) / pinhole[:2]
-    expected = scene(plain[..., 0], plain[..., 1])
-    got = Undistorter(where)(seen)[..., 0]
-    assert np.abs(got[2:-2, 2:-2] - expected[2:-2, 2:-2]).max() < 30
 
 
 def test_a_lamp_in_a_working_frame_with_a_shoulder_gets_no_brighter_rim():

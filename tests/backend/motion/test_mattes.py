@@ -47,6 +47,10 @@ def still(n: float) -> tuple[float, float]:
     return 0.0, 0.0
 
 
+def up_and_down(share: float) -> tuple[float, float]:
+    return 0.0, 0.08 * np.sin(7 * share)
+
+
 def build(
     root, where=still, travel=0.8, sway=1.0, wall: np.ndarray | None = None, numbers=NUMBERS, fps=10
 ) -> tuple[Shot, np.ndarray]:
@@ -116,7 +120,18 @@ def grown(mask: np.ndarray, by: int) -> np.ndarray:
 @pytest.fixture(scope="module")
 def swaying(tmp_path_factory, quiet):
     """The board sways up and down by 0.08 units, which are 5 pixels."""
-    shot, board = build(tmp_path_factory.mktemp("sway"), lambda share: (0.0, 0.08 * np.sin(7 * share)))
+    shot, board = build(tmp_path_factory.mktemp("sway"), up_and_down)
+    return shot, board, find_motion(shot, quiet(), static_model=None)
+
+
+@pytest.fixture
+def shot(swaying, tmp_path):
+    return Shot(shutil.copytree(swaying[0].root, tmp_path / "own.splannequin"))
+
+
+@pytest.fixture(scope="module")
+def static(tmp_path_factory, quiet):
+    shot, board = build(tmp_path_factory.mktemp("static"))
     return shot, board, find_motion(shot, quiet(), static_model=None)
 
 
@@ -131,49 +146,36 @@ def test_what_moves_is_found_and_the_wall_is_still(swaying):
     assert result["unknown_share"] == pytest.approx((labels == UNKNOWN).mean(), abs=1e-3)
 
 
-def test_motion_along_epipolar_lines_is_found(tmp_path, quiet):
-    """Camera and board move only sideways, so every match lies on its epipolar line."""
-    shot, board = build(tmp_path, lambda share: (0.1 * np.sin(7 * share), 0.0), sway=0.0)
+BARE = (128 + np.random.default_rng(3).normal(0, 1, (900, 1200))).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("world", "found", "margin", "mistaken"),
+    [
+        # Camera and board move only sideways, so every match lies on its epipolar line.
+        (dict(where=lambda share: (0.1 * np.sin(7 * share), 0.0), sway=0.0), 0.9, 8, 0.01),
+        # A slow sway: between neighbouring frames the motion is below the noise of optical flow.
+        (
+            dict(where=lambda share: (0.004 * np.sin(4 * share), 0.008 * np.sin(6 * share)), numbers=[*range(1, 31)]),
+            0.8, 8, 0.01,
+        ),
+        # Optical flow is smooth: on a bare wall it copies the motion of the object in front.
+        (dict(where=up_and_down, wall=BARE), 0.7, 10, 0.02),
+        (dict(where=up_and_down, travel=0.0), 0.95, 8, 0.01),
+    ],
+    ids=["along epipolar lines", "half a pixel", "before a bare wall", "tripod"],
+)  # fmt: skip
+def test_motion_is_found(tmp_path, quiet, world, found, margin, mistaken):
+    shot, board = build(tmp_path, **world)
     find_motion(shot, quiet(), static_model=None)
-    labels = mattes(shot)
-    assert (labels[inner(board)] == MOVING).mean() > 0.9
-    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
+    labels = mattes(shot, world.get("numbers", NUMBERS))
+    assert (labels[inner(board)] == MOVING).mean() > found
+    assert (labels[~grown(board, margin)] == MOVING).mean() < mistaken
 
 
-def test_a_slow_sway_of_half_a_pixel_is_found(tmp_path, quiet):
-    """Between neighbouring frames the motion is below the noise of optical flow."""
-    numbers = list(range(1, 31))
-    where = lambda share: (0.004 * np.sin(4 * share), 0.008 * np.sin(6 * share))  # noqa: E731
-    shot, board = build(tmp_path, where, numbers=numbers)
-    find_motion(shot, quiet(), static_model=None)
-    labels = mattes(shot, numbers)
-    assert (labels[inner(board)] == MOVING).mean() > 0.8
-    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
-
-
-def test_a_still_world_is_still(tmp_path, quiet):
-    shot, _ = build(tmp_path)
-    result = find_motion(shot, quiet(), static_model=None)
+def test_a_still_world_is_still(static):
+    result = static[2]
     assert result["motion_pixels_share"] < 0.01 and result["unknown_share"] < 0.05
-
-
-def test_a_bare_wall_before_which_something_moves_is_still(tmp_path, quiet):
-    """Optical flow is smooth: on a bare wall it copies the motion of the object in front."""
-    rng = np.random.default_rng(3)
-    bare = (128 + rng.normal(0, 1, (900, 1200))).astype(np.uint8)
-    shot, board = build(tmp_path, lambda share: (0.0, 0.08 * np.sin(7 * share)), wall=bare)
-    find_motion(shot, quiet(), static_model=None)
-    labels = mattes(shot)
-    assert (labels[inner(board)] == MOVING).mean() > 0.7
-    assert (labels[~grown(board, 10)] == MOVING).mean() < 0.02
-
-
-def test_a_tripod_has_a_matte_too(tmp_path, quiet):
-    shot, board = build(tmp_path, lambda share: (0.0, 0.08 * np.sin(7 * share)), travel=0.0)
-    find_motion(shot, quiet(), static_model=None)
-    labels = mattes(shot)
-    assert (labels[inner(board)] == MOVING).mean() > 0.95
-    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
 
 
 def test_a_frame_whose_pose_was_guessed_does_not_move(tmp_path, quiet):
@@ -214,8 +216,7 @@ def test_existing_mattes_are_kept(swaying, quiet):
     assert stamps(shot) == before
 
 
-def test_damaged_points_of_surfaces_are_found_again(swaying, tmp_path, quiet):
-    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+def test_damaged_points_of_surfaces_are_found_again(swaying, shot, quiet):
     before = {path: path.read_bytes() for path in sorted(shot.motion.iterdir())}
     victim = next(path for path in before if path.suffix == ".npz")
     victim.write_bytes(before[victim][:500])
@@ -223,9 +224,8 @@ def test_damaged_points_of_surfaces_are_found_again(swaying, tmp_path, quiet):
     assert {path: path.read_bytes() for path in sorted(shot.motion.iterdir())} == before
 
 
-def test_mattes_whose_search_was_cancelled_are_looked_for_again(swaying, tmp_path, quiet):
+def test_mattes_whose_search_was_cancelled_are_looked_for_again(shot, quiet):
     """Otherwise a training that found outdated mattes and was then paused would continue without any."""
-    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
     record = json.loads((shot.motion / "motion.json").read_text())
     write_json(shot.motion / "motion.json", {**record, "version": record["version"] - 1})
     assert is_outdated(shot)
@@ -236,11 +236,11 @@ def test_mattes_whose_search_was_cancelled_are_looked_for_again(swaying, tmp_pat
     assert is_found(shot) and not is_outdated(shot)
 
 
-def test_a_clip_that_cannot_be_learnt_is_left_to_flow_with_a_word(swaying, tmp_path, quiet):
+def test_a_clip_that_cannot_be_learnt_is_left_to_flow_with_a_word(swaying, shot, quiet):
     def refuse(shot, report):
         raise JobError("The camera hardly moves.", "Walk.")
 
-    shot, report = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin")), quiet()
+    report = quiet()
     find_motion(shot, report, static_model=refuse)
     assert not report.events, "mattes that are there need no model"
     shutil.rmtree(shot.motion)
@@ -273,8 +273,7 @@ def test_damaged_matte_is_reported_and_recomputed(swaying, quiet):
     assert victim.read_bytes() == whole
 
 
-def test_mattes_of_an_older_solve_are_not_read(swaying, tmp_path, quiet):
-    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+def test_mattes_of_an_older_solve_are_not_read(shot, quiet):
     key = motion_key(shot)
     path = CameraPath.load(shot.solve / "cameras.json")
     path.frames[0].K[0] += 1.0
@@ -304,9 +303,8 @@ find_motion(Shot(sys.argv[1]), Report(), static_model=None)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
-def test_a_killed_search_goes_on_where_it_was(swaying, tmp_path, quiet):
+def test_a_killed_search_goes_on_where_it_was(swaying, shot, quiet):
     """Files written before the kill stay; the later ones equal those of an undisturbed search."""
-    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
     shutil.rmtree(shot.solve / "motion")
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
     ran = subprocess.run([sys.executable, "-P", "-c", KILLED, str(shot.root)], env=environment, check=False)
@@ -343,9 +341,8 @@ def seen_at(shot: Shot, number: int, xyz: np.ndarray) -> np.ndarray:
     return np.floor(FOCAL * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]).astype(int)
 
 
-def test_points_of_a_still_world_lie_on_its_surfaces_and_cover_them(tmp_path, quiet):
-    shot, board = build(tmp_path)
-    find_motion(shot, quiet(), static_model=None)
+def test_points_of_a_still_world_lie_on_its_surfaces_and_cover_them(static):
+    shot, board, _ = static
     found = load_surface(shot)
     assert set(found.frames) == set(NUMBERS) and found.rgb.dtype == np.uint8
     for n in (2, 7, 11):
@@ -393,8 +390,7 @@ def test_what_is_ignored_gives_no_points(tmp_path, quiet):
     assert len(x) > 2000 and (x >= WIDTH // 2 - 2).all()
 
 
-def test_a_shot_solved_before_points_were_kept_has_them_when_it_is_solved_again(swaying, tmp_path, quiet):
-    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+def test_a_shot_solved_before_points_were_kept_has_them_when_it_is_solved_again(swaying, shot, quiet):
     for file in shot.motion.glob("*.npz"):
         file.unlink()
     key, pictures = motion_key(shot), {p: p.read_bytes() for p in shot.motion.glob("*.png")}
@@ -409,8 +405,7 @@ def test_a_shot_solved_before_points_were_kept_has_them_when_it_is_solved_again(
     assert stamps(shot) == before
 
 
-def test_points_go_with_the_mattes_and_a_damaged_file_is_done_without(swaying, tmp_path, quiet):
-    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+def test_points_go_with_the_mattes_and_a_damaged_file_is_done_without(shot, quiet):
     whole = load_surface(shot)
     shot.surface(NUMBERS[3]).write_bytes(b"PK not a file of arrays")
     left = load_surface(shot)
@@ -433,11 +428,6 @@ def paint(shot: Shot, pixels: np.ndarray, number: int = NUMBERS[0]) -> None:
     path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
 
 
-@pytest.fixture
-def shot_copy(swaying, tmp_path):
-    return Shot(shutil.copytree(swaying[0].root, tmp_path / "own.splannequin"))
-
-
 def ramp(dtype) -> np.ndarray:
     """Three bands of grey: still, unknown, moving."""
     top = np.iinfo(dtype).max
@@ -446,68 +436,67 @@ def ramp(dtype) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_paint_of_any_depth_goes_before_what_was_found(shot_copy, dtype, channels):
-    key = motion_key(shot_copy)
+def test_paint_of_any_depth_goes_before_what_was_found(shot, dtype, channels):
+    key = motion_key(shot)
     pixels = ramp(dtype)
     if channels > 1:
         pixels = np.repeat(pixels[..., None], channels, -1)
         if channels == 4:
             pixels[..., 3] = np.iinfo(dtype).max
-    paint(shot_copy, pixels)
-    labels = load_motion(shot_copy, NUMBERS[0])
-    assert labels is not None and motion_key(shot_copy) != key
+    paint(shot, pixels)
+    labels = load_motion(shot, NUMBERS[0])
+    assert labels is not None and motion_key(shot) != key
     assert (labels == np.repeat(np.array([STILL, UNKNOWN, MOVING], np.uint8), WIDTH // 3)[None]).all()
-    assert (load_motion(shot_copy, NUMBERS[1]) == load_motion(shot_copy, NUMBERS[1])).all()
 
 
-def test_paint_of_another_size_is_fitted_without_in_between_values(shot_copy):
+def test_paint_of_another_size_is_fitted_without_in_between_values(shot):
     pixels = np.zeros((190, 251), np.uint8)
     pixels[:, 125:] = 255
-    paint(shot_copy, pixels)
-    labels = load_motion(shot_copy, NUMBERS[0])
+    paint(shot, pixels)
+    labels = load_motion(shot, NUMBERS[0])
     assert labels is not None and labels.shape == (HEIGHT, WIDTH)
     edge = int(125 * WIDTH / 251)
     assert (labels[:, :edge] == STILL).all() and (labels[:, edge + 1 :] == MOVING).all()
     assert set(np.unique(labels)) == {STILL, MOVING}
 
 
-def test_where_paint_is_transparent_the_found_matte_shows(shot_copy):
-    found = load_motion(shot_copy, NUMBERS[0])
+def test_where_paint_is_transparent_the_found_matte_shows(shot):
+    found = load_motion(shot, NUMBERS[0])
     pixels = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
     pixels[:, 60:, 3] = 120
-    paint(shot_copy, pixels)
-    labels = load_motion(shot_copy, NUMBERS[0])
+    paint(shot, pixels)
+    labels = load_motion(shot, NUMBERS[0])
     assert labels is not None and found is not None
     assert (labels[:, :60] == MOVING).all() and (labels[:, 60:] == found[:, 60:]).all()
 
 
-def test_paint_stays_when_the_shot_is_solved_again(shot_copy, quiet):
-    paint(shot_copy, np.full((HEIGHT, WIDTH), 255, np.uint8))
-    path = CameraPath.load(shot_copy.solve / "cameras.json")
+def test_paint_stays_when_the_shot_is_solved_again(shot, quiet):
+    paint(shot, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    path = CameraPath.load(shot.solve / "cameras.json")
     path.frames[0].K[0] += 1.0
-    write_json(shot_copy.solve / "cameras.json", path.to_json())
-    assert (load_motion(shot_copy, NUMBERS[0]) == MOVING).all()  # also if there are no other mattes
-    find_motion(shot_copy, quiet(), static_model=None)
-    assert (load_motion(shot_copy, NUMBERS[0]) == MOVING).all()
-    assert (load_motion(shot_copy, NUMBERS[1]) == STILL).any()
+    write_json(shot.solve / "cameras.json", path.to_json())
+    assert (load_motion(shot, NUMBERS[0]) == MOVING).all()  # also if there are no other mattes
+    find_motion(shot, quiet(), static_model=None)
+    assert (load_motion(shot, NUMBERS[0]) == MOVING).all()
+    assert (load_motion(shot, NUMBERS[1]) == STILL).any()
 
 
-def test_damaged_paint_is_named(shot_copy):
-    (shot_copy.root / PAINTED).mkdir()
-    (shot_copy.root / PAINTED / f"{NUMBERS[0]:06d}.png").write_bytes(b"\x89PNG\r\n\x1a\nnot more")
+def test_damaged_paint_is_named(shot):
+    (shot.root / PAINTED).mkdir()
+    (shot.root / PAINTED / f"{NUMBERS[0]:06d}.png").write_bytes(b"\x89PNG\r\n\x1a\nnot more")
     with pytest.raises(JobError, match=r"painted motion matte .*001001\.png is damaged"):
-        load_motion(shot_copy, NUMBERS[0])
+        load_motion(shot, NUMBERS[0])
 
 
-def test_oversized_paint_is_refused_before_decoding(shot_copy):
-    paint(shot_copy, np.full((HEIGHT, WIDTH), 255, np.uint8))
-    file = shot_copy.painted_matte(NUMBERS[0])
+def test_oversized_paint_is_refused_before_decoding(shot):
+    paint(shot, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    file = shot.painted_matte(NUMBERS[0])
     content = bytearray(file.read_bytes())
     content[16:24] = struct.pack(">II", 16000, 16000)
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
     file.write_bytes(content)
     with pytest.raises(JobError, match=r"001001\.png is 16000 x 16000 pixels according to its header"):
-        load_motion(shot_copy, NUMBERS[0])
+        load_motion(shot, NUMBERS[0])
 
 
 # --------------------------------------------------------------------------------------------------- in one process

@@ -1,6 +1,6 @@
 """The compiled SSIM implementations, compared with the same formulas in float64 torch and autograd."""
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -102,12 +102,6 @@ def test_torch_path_stays_on_the_images_device():
     assert value.device.type == image.grad.device.type == "meta"
 
 
-def test_torch_path_passes_gradcheck():
-    image, target = pair(12, 13, 1)
-    x = image.double().requires_grad_()
-    assert torch.autograd.gradcheck(losses.ssim, (x, target.double()))
-
-
 @pytest.mark.parametrize(("height", "width"), [(17, 23), (75, 101)])
 def test_any_number_of_threads_gives_the_same_bits(height, width):
     image, target = pair(height, width, 3)
@@ -128,18 +122,9 @@ def test_any_number_of_threads_gives_the_same_bits(height, width):
 def test_callers_in_several_threads_do_not_mix():
     pairs = [pair(40 + 3 * i, 50, 3) for i in range(4)]
     single = [ssim(x, y, 2) for x, y in pairs]
-    together: list[torch.Tensor | None] = [None] * len(pairs)
-
-    def work(i):
-        for _ in range(5):
-            together[i] = ssim(*pairs[i], 2)
-
-    workers = [threading.Thread(target=work, args=(i,)) for i in range(len(pairs))]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    assert all(torch.equal(a, b) for a, b in zip(single, together))
+    with ThreadPoolExecutor(len(pairs)) as pool:
+        together = list(pool.map(lambda pair: [ssim(*pair, 2) for _ in range(5)], pairs))
+    assert all(torch.equal(a, b) for a, several in zip(single, together) for b in several)
 
 
 def test_sizes_may_alternate():

@@ -1,6 +1,5 @@
 """The first frame of the bundled clip and damaged versions of it; the tiny world as a ground-truth folder."""
 
-import sys
 from pathlib import Path
 
 import av
@@ -9,6 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world
 from torch_backend.footage.images import write_png
 from torch_backend.raster import rasterize
 from torch_backend.shot import write_json
@@ -35,22 +35,20 @@ def damaged(frame):
 
 
 @pytest.fixture(scope="session")
-def write_truth(quiet):
+def write_truth():
     """write_truth(folder): writes a ground-truth folder of the tiny world, with two instants and four poses."""
-    build_world, module = sys.modules[quiet.__module__].build_world, sys.modules[quiet.__module__]
 
     def write(folder: Path):
         world = build_world(folder)
-        first, count = module.FIRST, module.FRAMES
         instants, poses = [2, 12], [2, 5, 9, 13]
         for t in instants:
             for p in poses:
-                name = f"{first + t:06d}_{first + p:06d}"
-                save(folder / "truth" / f"{name}.png", world.image(p, t / (count - 1)))
-                for region, mask in regions_of(world, module, t, p).items():
+                name = f"{FIRST + t:06d}_{FIRST + p:06d}"
+                save(folder / "truth" / f"{name}.png", world.image(p, t / (FRAMES - 1)))
+                for region, mask in regions_of(world, t, p).items():
                     save(folder / "regions" / f"{name}_{region}.png", mask[..., None].expand(-1, -1, 3).float())
         facts = {"version": 1, "name": "tiny", "cameras": "exact", "shot": "tiny.splannequin", "fps": 2.5}
-        facts |= {"t_stars": [first + t for t in instants], "poses": [first + p for p in poses]}
+        facts |= {"t_stars": [FIRST + t for t in instants], "poses": [FIRST + p for p in poses]}
         write_json(folder / "truth.json", {**facts, "regions": ["seen", "never_seen", "moving", "static"]})
         return world
 
@@ -61,14 +59,14 @@ def save(path: Path, image: torch.Tensor) -> None:
     write_png(path, (image * 255 + 0.5).to(torch.uint8).contiguous().numpy())
 
 
-def regions_of(world, module, t: int, p: int) -> dict[str, torch.Tensor]:
+def regions_of(world, t: int, p: int) -> dict[str, torch.Tensor]:
     """Ground-truth regions. The wall's depth of 4 gives the pixels of plate t* that show a pose's pixels."""
-    without = {k: v[~world.moving] for k, v in world.at(t / (module.FRAMES - 1)).items()}
+    without = {k: v[~world.moving] for k, v in world.at(t / (FRAMES - 1)).items()}
     pose = {"viewmats": world.viewmats[p : p + 1], "Ks": world.K[None], "background": torch.full((3,), 0.5)}
-    wall = rasterize(**without, **pose, width=module.WIDTH, height=module.HEIGHT).colors[0].clamp(0, 1)
-    moving = (wall - world.image(p, t / (module.FRAMES - 1))).abs().amax(2) > 0.05
-    y, x = torch.meshgrid(torch.arange(module.HEIGHT) + 0.5, torch.arange(module.WIDTH) + 0.5, indexing="ij")
+    wall = rasterize(**without, **pose, width=WIDTH, height=HEIGHT).colors[0].clamp(0, 1)
+    moving = (wall - world.image(p, t / (FRAMES - 1))).abs().amax(2) > 0.05
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     shift = 60 / 4 * (world.viewmats[t, :2, 3] - world.viewmats[p, :2, 3])
     x, y = x + shift[0], y + shift[1]
-    seen = (x >= 0) & (x < module.WIDTH) & (y >= 0) & (y < module.HEIGHT)
+    seen = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
     return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving}

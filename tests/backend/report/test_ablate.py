@@ -23,7 +23,7 @@ from benchmarks.other_state import CHANGED, Painted, Pair, Polygon
 
 @pytest.fixture(scope="module")
 def clip(trained):
-    return open_clip(trained[0].shot.root)
+    return open_clip(trained.shot.root)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from torch_backend.shot import Shot, write_json
 
 @pytest.fixture(scope="module")
 def shot(trained):
-    return trained[0].shot
+    return trained.shot
 
 
 def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tmp_path):

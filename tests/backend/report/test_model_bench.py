@@ -12,8 +12,7 @@ from torch_backend.shot import Shot, write_json
 
 
 def test_a_trained_run_is_judged_frozen_and_developed_on_frames_that_it_has_not_seen(trained, tmp_path):
-    world, _ = trained
-    command = [str(world.shot.root), "--run", "main", "--results", str(tmp_path), "--t-star", "103", "--develop"]
+    command = [str(trained.shot.root), "--run", "main", "--results", str(tmp_path), "--t-star", "103", "--develop"]
     # Without a large `instant_share`, developing makes this sharp run worse on plate t*, and its result is discarded.
     assert main([*command, "--develop-set", "steps=40", "gain=-99", "instant_share=0.6", "--held", "1"]) == 0
     result = json.loads((tmp_path / "model.json").read_text())
@@ -27,14 +26,12 @@ def test_a_trained_run_is_judged_frozen_and_developed_on_frames_that_it_has_not_
 
 
 def test_a_number_that_the_configuration_does_not_have_is_named(trained, tmp_path, capsys):
-    world, _ = trained
-    command = [str(world.shot.root), "--results", str(tmp_path), "--set", "gate.strat=0.4"]
+    command = [str(trained.shot.root), "--results", str(tmp_path), "--set", "gate.strat=0.4"]
     assert main(command) == 1 and "gate.strat" in capsys.readouterr().err
 
 
 def test_what_the_mask_ignores_is_not_judged(trained, tmp_path):
-    world, _ = trained
-    shot = Shot(shutil.copytree(world.shot.root, tmp_path / "logo.splannequin"))
+    shot = Shot(shutil.copytree(trained.shot.root, tmp_path / "logo.splannequin"))
     plate = shot.frames / "000109.png"
     pixels = read_png(plate)
     pixels[: len(pixels) // 2] = 255 - pixels[: len(pixels) // 2]  # half of the plate shows something else

@@ -6,15 +6,14 @@ import torch
 
 from benchmarks.report.real import far_from, motion_shares, near
 from benchmarks.report.truth import RealScene
+from tests.backend.conftest import build_world
 from torch_backend.motion.mattes import MOVING, PAINTED, STILL, UNKNOWN, write_matte
 from torch_backend.shot import Shot
 
 
 @pytest.fixture(scope="module")
-def shot(quiet, tmp_path_factory):
-    import sys
-
-    return sys.modules[quiet.__module__].build_world(tmp_path_factory.mktemp("real")).shot
+def shot(tmp_path_factory):
+    return build_world(tmp_path_factory.mktemp("real")).shot
 
 
 def painted(shot, frame: int) -> np.ndarray:

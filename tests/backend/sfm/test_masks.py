@@ -107,7 +107,7 @@ def test_solve_key_depends_on_mask_content_not_path(masked, tmp_path, tools):
     assert not any(stage == "solve: features" for stage, *_ in report.steps)
     for file in (tmp_path / "moved").iterdir():
         write_png(file, np.roll(read_png(file), 12, axis=1))
-    again = tools.recorder(cancel_at="solve: features")
+    again = tools.recorder(cancel_at=("solve: features", 0.0))
     with pytest.raises(tools.cancelled):
         solve_shot(copy, config(tmp_path / "moved"), again)
 

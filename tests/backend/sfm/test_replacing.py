@@ -66,7 +66,7 @@ def test_a_cancelled_solve_leaves_the_one_before_it(again, tools):
     before = contents(shot)
     for stage in ("solve: lens", "solve: undistort"):
         with pytest.raises(Cancelled):
-            solve_shot(shot, SolveConfig(), tools.recorder(cancel_at=stage), cameras)
+            solve_shot(shot, SolveConfig(), tools.recorder(cancel_at=(stage, 0.0)), cameras)
         assert contents(shot) == before
 
 
@@ -106,7 +106,7 @@ def test_st_maps_of_the_lens_before_go_and_that_is_said(again, tools):
     for path in maps:
         path.write_bytes(b"of a solve of before")
     with pytest.raises(Cancelled):
-        solve_shot(shot, SolveConfig(), tools.recorder(cancel_at="solve: undistort"), cameras)
+        solve_shot(shot, SolveConfig(), tools.recorder(cancel_at=("solve: undistort", 0.0)), cameras)
     assert all(path.is_file() for path in maps)
     report = tools.recorder()
     solve_shot(shot, SolveConfig(), report, cameras)

@@ -46,6 +46,7 @@ def refusal(shot, report, **settings):
     with pytest.raises(JobError) as error:
         solve_shot(shot, SolveConfig(features=700, **settings), report)
     assert error.value.exit_code == ExitCode.SOLVE and not (shot.solve / "scratch").exists()
+    assert not shot.cameras.exists()
     return error.value.message, error.value.hint, report.warnings
 
 

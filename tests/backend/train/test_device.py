@@ -9,12 +9,12 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._device import _device_constructors
 
 import torch_backend
+from tests.backend.trainings import take_steps
 from torch_backend.contract import FreezeParams, JobError, TrainParams
 from torch_backend.freeze import freeze_shot
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import choose_device, config_from_params, load_run, train_shot
 from torch_backend.train.device import cuda_refusal, decide_device
-from torch_backend.train.events import schedule_events
 from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
 
@@ -99,20 +99,14 @@ def test_run_resumes_and_freezes_on_a_second_device(world, quiet):
     images = load_images(scene, scene.solved, 64, 48)
     config = config_from_params(TrainParams(iterations=60, max_gaussians=1500))
     trainer = Trainer(scene, images.cuda(), scene.solved, config, quiet(), {}, "cuda")
-    for _ in range(30):
-        schedule_events(trainer)
-        trainer.step()
-        trainer.iteration += 1
+    take_steps(trainer, 30)
     path = world.shot.root / "gpu.safetensors"
     save_run(trainer, path)
     for device in ("cpu", "cuda"):
         resumed = Trainer(scene, images.to(device), scene.solved, config, quiet(), {}, device)
         restore_run(resumed, path)
         assert torch.equal(resumed.generator.get_state(), trainer.generator.get_state())
-        for _ in range(10):
-            schedule_events(resumed)
-            loss = resumed.step()
-            resumed.iteration += 1
+        loss = take_steps(resumed, 10)
         assert loss.device.type == device and bool(torch.isfinite(loss))
 
 

@@ -6,20 +6,15 @@ import shutil
 from dataclasses import replace
 
 import pytest
-import torch
 
+from tests.backend.trainings import assert_same_run, short
 from torch_backend import contract
-from torch_backend.cli import main, parser
 from torch_backend.contract import PRESET_STEPS, Cancelled, FreezeParams, JobError, TrainParams, read_json
 from torch_backend.deformation import hosts
 from torch_backend.freeze import freeze_shot
 from torch_backend.train import PRESETS, run, train_shot
-from torch_backend.train.checkpoint import load_checkpoint, read_meta
+from torch_backend.train.checkpoint import read_meta
 from torch_backend.train.extend import EXTENSION_FILE, Extension
-
-
-def short(name, **changes):
-    return TrainParams(run=name, iterations=60, max_gaussians=1500, **changes)
 
 
 def more(name, steps=40, **changes):
@@ -39,14 +34,6 @@ def finished(world, quiet):
     return copy
 
 
-def same(first, second):
-    a, b = (load_checkpoint(path / "checkpoint.safetensors") for path in (first, second))
-    assert a[0].keys() == b[0].keys()
-    for name, value in a[0].items():
-        torch.testing.assert_close(b[0][name], value, rtol=1e-4, atol=1e-5, msg=name)
-    assert a[1]["iteration"] == b[1]["iteration"]
-
-
 def test_an_interrupted_extension_ends_exactly_where_an_unbroken_one_does(world, quiet, finished, monkeypatch):
     whole, paused, killed = (finished(name) for name in ("ext-whole", "ext-paused", "ext-killed"))
     summary = train_shot(world.shot, more("ext-whole"), quiet())
@@ -57,7 +44,7 @@ def test_an_interrupted_extension_ends_exactly_where_an_unbroken_one_does(world,
     report = quiet()
     train_shot(world.shot, more("ext-paused"), report)
     assert next(e for e in report.events if e[:2] == ("progress", "training"))[2:4] == (20, 40)
-    same(whole, paused)
+    assert_same_run(whole, paused)
 
     class Dies(quiet):
         def image(self, label, path):
@@ -72,7 +59,7 @@ def test_an_interrupted_extension_ends_exactly_where_an_unbroken_one_does(world,
     assert read_meta(killed / EXTENSION_FILE)["iteration"] == 87
     assert read_meta(killed / "checkpoint.safetensors")["iteration"] == 60
     train_shot(world.shot, more("ext-killed"), quiet())
-    same(whole, killed)
+    assert_same_run(whole, killed)
     for folder in (whole, paused, killed):
         assert not (folder / EXTENSION_FILE).exists()
         rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
@@ -141,15 +128,15 @@ def test_figures_missing_after_a_kill_are_recomputed(world, quiet, finished):
 
 
 def test_more_steps_do_not_make_it_worse(trained, quiet):
-    world, before = trained
-    shutil.copytree(world.shot.run("main"), world.shot.run("ext-better"))
-    after = train_shot(world.shot, more("ext-better", 300), quiet())
+    before = trained.summary
+    shutil.copytree(trained.shot.run("main"), trained.shot.run("ext-better"))
+    after = train_shot(trained.shot, more("ext-better", 300), quiet())
     # At 50 dB the restarted learning rates are visible, by 1.2 dB on some CPUs. On a real clip at 25 dB, 800 steps gain
     # 0.19 dB.
     assert after["heldout_psnr_db"] > before["heldout_psnr_db"] - 2.0
     losses = {}
     for name in ("main", "ext-better"):
-        rows = [json.loads(line) for line in (world.shot.run(name) / "metrics.jsonl").read_text().splitlines()]
+        rows = [json.loads(line) for line in (trained.shot.run(name) / "metrics.jsonl").read_text().splitlines()]
         losses[name] = rows[-1]["heldout_psnr_db"]
     assert losses["ext-better"] == pytest.approx(after["heldout_psnr_db"], abs=1e-3)
 
@@ -219,16 +206,6 @@ def test_a_run_that_ended_early_goes_on_over_all_its_frames(world, quiet, monkey
     assert facts["needs"]["joined"]
     ends = [row["detail"] for row in after["modelled"] if row["what"] == "end"]
     assert ends == [f"stopped at step {before['iterations']} of 500: nothing more was gained"]
-
-
-def test_the_command_line_takes_it(world, quiet, finished, capsys):
-    finished("ext-cli")
-    args = parser().parse_args(["train", "x", "--run", "y", "--extend", "12"])
-    assert args.extend == 12
-    assert main(["train", str(world.shot.root), "--run", "ext-cli", "--extend", "10"]) == 0
-    assert read_json(world.shot.run("ext-cli") / "summary.json")["iterations"] == 70
-    assert main(["train", str(world.shot.root), "--run", "ext-gone", "--extend", "10"]) == 5
-    assert "no trained run 'ext-gone' to extend" in capsys.readouterr().out
 
 
 def test_preset_steps_match_those_in_blender():

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world
+from tests.backend.trainings import take_steps
 from torch_backend.contract import TrainParams, read_json
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.scene import load_images, load_scene
 from torch_backend.sfm.masks import IGNORE, load_mask, write_grey
 from torch_backend.shot import write_json
 from torch_backend.train import config_from_params, train_shot
-from torch_backend.train.events import schedule_events
 from torch_backend.train.evidence import gather_evidence
 from torch_backend.train.ignored import load_ignored
 from torch_backend.train.trainer import Trainer
@@ -56,10 +56,7 @@ def shown_behind(world, quiet, ignored):
     images = load_images(scene, scene.solved, WIDTH, HEIGHT)
     found = load_ignored(masks_of(world), scene, scene.solved, WIDTH, HEIGHT) if ignored else {}
     trainer = Trainer(scene, images, scene.solved, config, quiet(), ignored=found)
-    for _ in range(150):
-        schedule_events(trainer)
-        trainer.step()
-        trainer.iteration += 1
+    take_steps(trainer, 150)
     mask = torch.from_numpy(LOGO)
     return trainer.render_frame(8)[mask], world.image(8, 8 / (FRAMES - 1))[mask]
 

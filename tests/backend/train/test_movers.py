@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world, paint_motion
+from tests.backend.trainings import assert_same_run, short, take_steps
 from torch_backend.contract import Cancelled, JobError, TrainParams
 from torch_backend.deformation import GateConfig
 from torch_backend.motion.mattes import MOVING, PAINTED, STILL, UNKNOWN, load_motion, write_matte
@@ -24,10 +25,6 @@ def painted_world(tmp_path_factory):
     return world
 
 
-def short(name, **changes):
-    return TrainParams(run=name, iterations=60, max_gaussians=1500, **changes)
-
-
 def paint_all(world, value):
     for n in range(FRAMES):
         path = world.shot.root / PAINTED / f"{FIRST + n:06d}.png"
@@ -41,10 +38,7 @@ def trainer_of(world, quiet, steps, movers=True, **changes):
     images = load_images(scene, scene.solved, WIDTH, HEIGHT)
     found = load_movers(lambda frame: load_motion(world.shot, frame), scene, scene.solved, WIDTH, HEIGHT)
     trainer = Trainer(scene, images, scene.solved, config, quiet(), movers=found if movers else None)
-    for _ in range(steps):
-        schedule_events(trainer)
-        trainer.step()
-        trainer.iteration += 1
+    take_steps(trainer, steps)
     return trainer
 
 
@@ -155,10 +149,7 @@ def test_it_resumes_exactly_with_mattes(painted_world, quiet):
         with pytest.raises(Cancelled):
             train_shot(painted_world.shot, short("broken"), quiet(cancel_at=("training", share)))
     train_shot(painted_world.shot, short("broken"), quiet())
-    whole, facts = load_checkpoint(painted_world.shot.run("whole") / "checkpoint.safetensors")
-    broken, _ = load_checkpoint(painted_world.shot.run("broken") / "checkpoint.safetensors")
-    assert facts["motion"]
-    assert whole.keys() == broken.keys()
-    assert any(name.startswith("field.") for name in whole)
-    for name, value in whole.items():
-        torch.testing.assert_close(value, broken[name], rtol=1e-4, atol=1e-5, msg=name)
+    runs = [painted_world.shot.run(name) for name in ("whole", "broken")]
+    assert_same_run(*runs)
+    tensors, facts = load_checkpoint(runs[0] / "checkpoint.safetensors")
+    assert facts["motion"] and any(name.startswith("field.") for name in tensors)

@@ -6,36 +6,25 @@ import numpy as np
 import pytest
 import torch
 
+from tests.backend.conftest import film
 from torch_backend.contract import Cancelled, JobError, TrainParams
-from torch_backend.footage import FootageConfig, import_footage
-from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
 from torch_backend.scene import load_images, load_scene
-from torch_backend.shot import Shot
 from torch_backend.train import config_from_params, identity, train_shot
 from torch_backend.train.config import config_from_json, config_to_json
 from torch_backend.train.pictures import pictures_of, training_size
 
 
 @pytest.fixture
-def shot(tmp_path, world, quiet):
+def shot(tmp_path, world):
     """The tiny shot, filmed at twice the size of its solve."""
-    (tmp_path / "source").mkdir()
     rng = np.random.default_rng(3)
-    for n in range(16):
+
+    def picture_of(n):
         small = np.kron(world.image(n, n / 15).numpy(), np.ones((2, 2, 1), np.float32))
-        fine = small * rng.uniform(0.8, 1.0, (96, 128, 1))
-        write_png(tmp_path / "source" / f"a.{101 + n}.png", (255 * fine).astype(np.uint8))
-    shot = Shot.create(tmp_path / "fine.splannequin")
-    import_footage(shot, str(tmp_path / "source"), FootageConfig(working_height=48), quiet())
-    for name in ("cameras.json", "points.npz"):
-        shot.solve.mkdir(exist_ok=True)
-        (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
-    record = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
-    (shot.solve / "solve.json").write_text(json.dumps(record))
-    for n in range(101, 117):
-        write_png(shot.frames / f"{n:06d}.png", read_png(shot.frames / "raw" / f"{n:06d}.png"))
-    return shot
+        return (255 * small * rng.uniform(0.8, 1.0, (96, 128, 1))).astype(np.uint8)
+
+    return film(world, tmp_path, picture_of, paint=False, working_height=48)
 
 
 def final(on_card, **changes):
@@ -130,7 +119,7 @@ def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(sh
     resumed = TrainParams(**{**vars(on_card), "width": 1920, "device": "cpu"})  # as Blender requests a paused run
     assert train_shot(shot, resumed, report)["width_px"] == 128
     assert any(event[0] == "progress" and "resumed at step" in event[4] for event in report.events)
-    warned = [event[1] for event in report.events if event[0] == "warning"]
+    warned = report.warnings
     assert warned[0] == "The run was started with the preset's settings for a graphics card, and continues with them."
     report = quiet()
     assert train_shot(shot, on_card, report)["width_px"] == 128

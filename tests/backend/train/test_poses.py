@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from tests.backend.trainings import take_steps
 from torch_backend.contract import TrainParams
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
-from torch_backend.train.events import schedule_events
 from torch_backend.train.poses import Poses, PosesConfig, _Gauge, _series, corrected
 from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
@@ -65,10 +65,7 @@ def wrong_cameras(world, quiet, on):
     config = config_from_params(TrainParams(iterations=900, max_gaussians=1200, method="static"))
     config.poses.on = on
     trainer = Trainer(scene, load_images(scene, scene.solved, 64, 48), scene.solved, config, quiet())
-    while trainer.iteration < 320:
-        schedule_events(trainer)
-        trainer.step()
-        trainer.iteration += 1
+    take_steps(trainer, 320)
     return trainer, truth
 
 

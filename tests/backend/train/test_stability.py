@@ -55,7 +55,7 @@ def go_on(trainer: Trainer, steps: int) -> list[float]:
 
 
 def warnings(trainer: Trainer) -> list[str]:
-    return [event[1] for event in trainer.report.events if event[0] == "warning"]
+    return trainer.report.warnings
 
 
 def finite(trainer: Trainer) -> bool:

@@ -4,23 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, World, build_world
+from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world
 from torch_backend.contract import Cancelled, JobError, TrainParams, read_json
 from torch_backend.footage.images import read_png
 from torch_backend.job import RUNNERS
 from torch_backend.motion.mattes import is_found, is_outdated
 from torch_backend.motion_search import find_motion
-from torch_backend.raster import rasterize
 from torch_backend.shot import Shot, write_json
 from torch_backend.train import static_views
 from torch_backend.train.static_world import STAGE, steps_for
-
-
-def patch_of(world: World, n: int, time: float) -> np.ndarray:
-    """[H, W] in 0..1: coverage of the swaying patch in each pixel of frame `n`, at the given time."""
-    state = {name: value[world.moving] for name, value in world.at(time).items()}
-    out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=WIDTH, height=HEIGHT)
-    return out.alphas[0].numpy()
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +30,7 @@ def test_it_shows_the_wall_at_every_frame_and_not_the_patch_where_it_is_for_a_mo
         picture = shown(FIRST + n)
         assert picture.shape == (HEIGHT, WIDTH, 3) and picture.dtype == np.uint8
         error = np.abs(picture.astype(int) - read_png(world.shot.plate(FIRST + n))).max(-1)
-        now, mirrored = (patch_of(world, n, time) for time in (n / (FRAMES - 1), 1.0 - n / (FRAMES - 1)))
+        now, mirrored = (world.patch(n, time) for time in (n / (FRAMES - 1), 1.0 - n / (FRAMES - 1)))
         clear.append(error[(now < 0.01) & (mirrored < 0.01)])
         passed.append(error[(now > 0.9) & (mirrored < 0.1)])
     clear, passed = np.concatenate(clear), np.concatenate(passed)

@@ -4,19 +4,19 @@ import copy
 import io
 import json
 import math
-import sys
 from dataclasses import dataclass
 
 import pytest
 import torch
 
+from tests.backend import conftest
+from tests.backend.trainings import take_steps
 from torch_backend.cli import Console
 from torch_backend.contract import Event, TrainParams
 from torch_backend.freeze.frozen import freeze_at, render_frozen
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
 from torch_backend.train.checkpoint import load_checkpoint
-from torch_backend.train.events import schedule_events
 from torch_backend.train.loop import train_to_end
 from torch_backend.train.model import restore_model
 from torch_backend.train.modelled import modelled
@@ -39,13 +39,11 @@ from torch_backend.train.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
-def long_world(tmp_path_factory, quiet):
+def long_world(tmp_path_factory):
     """(scene, images) of the tiny shot, extended so that it has probe frames."""
-    module = sys.modules[quiet.__module__]
-    patch = pytest.MonkeyPatch()
-    patch.setattr(module, "FRAMES", 30)
-    world = module.build_world(tmp_path_factory.mktemp("long"))
-    patch.undo()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conftest, "FRAMES", 30)
+        world = conftest.build_world(tmp_path_factory.mktemp("long"))
     scene = load_scene(world.shot)
     return scene, load_images(scene, scene.solved, 64, 48)
 
@@ -140,19 +138,13 @@ def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     assert len(probes) == 3
     runs[1].images[probes] = 1.0  # destroys these pictures
     for trainer in runs:
-        while trainer.iteration < 60:
-            schedule_events(trainer)
-            trainer.step()
-            trainer.iteration += 1
+        take_steps(trainer, 60)
     assert bool(runs[0].model.gaussians.open.any())
     for name, value in runs[0].model.gaussians.params.items():
         assert torch.equal(value, runs[1].model.gaussians.params[name]), name
     assert not runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
     for trainer in runs:
-        while trainer.iteration < 99:
-            schedule_events(trainer)
-            trainer.step()
-            trainer.iteration += 1
+        take_steps(trainer, 39)
     assert runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
     assert not torch.equal(runs[0].model.gaussians.params["sh0"], runs[1].model.gaussians.params["sh0"])
 
@@ -310,10 +302,7 @@ def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
     whole = finish(trainer_of(long_world, quiet, **changes), tmp_path)
     for stop in (45, 72):
         broken = trainer_of(long_world, quiet, **changes)
-        while broken.iteration < stop:
-            schedule_events(broken)
-            broken.step()
-            broken.iteration += 1
+        take_steps(broken, stop)
         save_run(broken, tmp_path / "broken.safetensors")
         resumed = trainer_of(long_world, quiet, **changes)
         restore_run(resumed, tmp_path / "broken.safetensors")
@@ -347,7 +336,7 @@ def test_time_nodes_follow_the_motion(long_world, quiet, tmp_path):
 
 
 def test_the_console_shows_the_table(trained):
-    _, summary = trained
+    summary = trained.summary
     rows = {row["what"]: row for row in summary["modelled"]}
     moving = rows["moving Gaussians"]
     assert moving["seconds"] + rows["static world"]["seconds"] == pytest.approx(summary["train_seconds"], abs=0.1)

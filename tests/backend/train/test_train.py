@@ -11,6 +11,8 @@ import pytest
 import torch
 
 import torch_backend.scene
+from tests.backend.conftest import build_world
+from tests.backend.trainings import assert_same_run, short
 from torch_backend.contract import Cancelled, ExitCode, JobError, TrainParams
 from torch_backend.gaussians import PARAM_NAMES
 from torch_backend.scene import load_images, load_scene
@@ -23,19 +25,19 @@ from torch_backend.train.trainer import Trainer
 
 
 def test_it_learns_and_reports(trained):
-    world, summary = trained
+    summary = trained.summary
     assert summary["heldout_psnr_db"] > 24.0
     assert summary["heldout_frames"] == 1
-    rows = [json.loads(line) for line in (world.shot.run("main") / "metrics.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (trained.shot.run("main") / "metrics.jsonl").read_text().splitlines()]
     assert [r["iteration"] for r in rows] == list(range(90, 901, 90))
     assert rows[-1]["heldout_psnr_db"] > rows[0]["heldout_psnr_db"]
     assert all(r["moving_share"] == 0 for r in rows if r["iteration"] < 180)
 
 
 def test_the_gate_opens_for_the_patch_that_moves(trained):
-    world, summary = trained
-    run = load_run(world.shot, "main")
-    scene = load_scene(world.shot)
+    summary = trained.summary
+    run = load_run(trained.shot, "main")
+    scene = load_scene(trained.shot)
     rows = run.model.open_rows()
     assert 0.005 < summary["moving_share"] < 0.4
     means = run.model.gaussians.params["means"].detach()[rows] / scene.scale + torch.from_numpy(scene.centre).float()
@@ -43,15 +45,11 @@ def test_the_gate_opens_for_the_patch_that_moves(trained):
     assert float(near.float().mean()) > 0.8
 
 
-def short(world, name, **changes):
-    return TrainParams(run=name, iterations=60, max_gaussians=1500, **changes)
-
-
 def test_frames_beyond_memory_train_identically_from_a_hidden_file(world, quiet, monkeypatch):
-    train_shot(world.shot, short(world, "held"), quiet())
+    train_shot(world.shot, short("held"), quiet())
     monkeypatch.setattr(torch_backend.scene, "IMAGE_MEMORY_BYTES", 0)
     scene, folder = load_scene(world.shot), world.shot.run("mapped")
-    train_shot(world.shot, short(world, "mapped"), quiet())
+    train_shot(world.shot, short("mapped"), quiet())
     from_file, _ = load_checkpoint(world.shot.run("held") / "checkpoint.safetensors")
     mapped, _ = load_checkpoint(folder / "checkpoint.safetensors")
     assert all(torch.equal(value, mapped[name]) for name, value in from_file.items())
@@ -71,23 +69,19 @@ def test_frames_that_no_disk_holds_are_refused_in_a_sentence(world, monkeypatch)
 
 
 def test_cancel_and_resume_end_exactly_where_an_unbroken_run_does(world, quiet):
-    train_shot(world.shot, short(world, "whole"), quiet())
+    train_shot(world.shot, short("whole"), quiet())
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short(world, "broken"), quiet(cancel_at=("training", 0.5)))
+        train_shot(world.shot, short("broken"), quiet(cancel_at=("training", 0.5)))
     _, meta = load_checkpoint(world.shot.run("broken") / "checkpoint.safetensors")
     assert 30 <= meta["iteration"] < 60
-    train_shot(world.shot, short(world, "broken"), quiet())
-    whole, _ = load_checkpoint(world.shot.run("whole") / "checkpoint.safetensors")
-    broken, _ = load_checkpoint(world.shot.run("broken") / "checkpoint.safetensors")
-    assert whole.keys() == broken.keys()
-    for name, value in whole.items():
-        torch.testing.assert_close(value, broken[name], rtol=1e-4, atol=1e-5, msg=name)
+    train_shot(world.shot, short("broken"), quiet())
+    assert_same_run(world.shot.run("whole"), world.shot.run("broken"))
 
 
 def test_a_finished_run_is_not_trained_again(world, quiet):
-    train_shot(world.shot, short(world, "once"), quiet())
+    train_shot(world.shot, short("once"), quiet())
     report = quiet()
-    train_shot(world.shot, short(world, "once"), report)
+    train_shot(world.shot, short("once"), report)
     assert ("progress", "training", 1, 1, "already trained") in report.events
 
 
@@ -107,7 +101,7 @@ def test_a_finished_run_is_not_trained_again(world, quiet):
 def test_every_method_and_preset_of_supervision_runs(world, quiet, method, supervision, more):
     name = "-".join(["m", method, supervision, *more.values()])
     report = quiet()
-    summary = train_shot(world.shot, short(world, name, method=method, supervision=supervision, **more), report)
+    summary = train_shot(world.shot, short(name, method=method, supervision=supervision, **more), report)
     assert math.isfinite(summary["heldout_psnr_db"])
     assert not [e for e in report.events if e[0] == "warning" and "skipped" in e[1]]
     assert summary["host_config"] == more.get("host_config", "default")
@@ -121,7 +115,7 @@ def test_every_method_and_preset_of_supervision_runs(world, quiet, method, super
 
 @pytest.mark.parametrize("host", ["hexplane", "control_points"])
 def test_state_can_be_evaluated_without_canonical_gradients(world, quiet, host):
-    train_shot(world.shot, short(world, f"pull-{host}", method=host), quiet())
+    train_shot(world.shot, short(f"pull-{host}", method=host), quiet())
     model = load_run(world.shot, f"pull-{host}").model
     with torch.no_grad():
         for p in model.field.parameters():
@@ -162,11 +156,7 @@ def test_any_host_works_behind_the_gate_and_resumes(world, quiet, host, monkeypa
     with pytest.raises(Cancelled):
         train_shot(world.shot, params("broken"), quiet(cancel_at=("training", 0.7)))
     train_shot(world.shot, params("broken"), quiet())
-    whole, _ = load_checkpoint(world.shot.run(f"whole-{host}") / "checkpoint.safetensors")
-    broken, _ = load_checkpoint(world.shot.run(f"broken-{host}") / "checkpoint.safetensors")
-    assert whole.keys() == broken.keys()
-    for name, value in whole.items():
-        torch.testing.assert_close(value, broken[name], rtol=1e-3, atol=1e-4, msg=name)
+    assert_same_run(world.shot.run(f"whole-{host}"), world.shot.run(f"broken-{host}"), rtol=1e-3, atol=1e-4)
 
 
 def test_wrong_choices_are_named():
@@ -240,12 +230,12 @@ def begun_in(run):
 
 
 def test_finished_run_is_kept_until_its_replacement_is_done(world, quiet):
-    train_shot(world.shot, short(world, "mixed"), quiet())
+    train_shot(world.shot, short("mixed"), quiet())
     run = world.shot.run("mixed")
     before = files_of(run)
     report = quiet(cancel_at=("training", 0.5))
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short(world, "mixed", seed=5), report)
+        train_shot(world.shot, short("mixed", seed=5), report)
     assert files_of(run) == before
     assert any(e[0] == "warning" and "training starts again" in e[1] and "is kept" in e[2] for e in report.events)
     assert load_run(world.shot, "mixed").config.seed == 0
@@ -253,10 +243,10 @@ def test_finished_run_is_kept_until_its_replacement_is_done(world, quiet):
     stopped = iteration_of(work)
     assert 30 <= stopped < 60
     report = quiet()
-    assert train_shot(world.shot, short(world, "mixed"), report)["iterations"] == 60
+    assert train_shot(world.shot, short("mixed"), report)["iterations"] == 60
     assert ("progress", "training", 1, 1, "already trained") in report.events
     report = quiet()
-    train_shot(world.shot, short(world, "mixed", seed=5), report)
+    train_shot(world.shot, short("mixed", seed=5), report)
     assert ("progress", "training", stopped, 60, f"resumed at step {stopped}") in report.events
     assert load_run(world.shot, "mixed").config.seed == 5
     assert not (run / "next").exists()
@@ -267,7 +257,7 @@ def test_finished_run_is_kept_until_its_replacement_is_done(world, quiet):
 
 def test_cancelled_evaluation_runs_on_resume(world, quiet, monkeypatch):
     """Two cancels in an evaluation, and two in the last one: the curve has no gap."""
-    train_shot(world.shot, short(world, "whole"), quiet())
+    train_shot(world.shot, short("whole"), quiet())
     measured, goes_on = Trainer.frame_psnrs, []
 
     def pressed(self, *args, **options):
@@ -279,10 +269,10 @@ def test_cancelled_evaluation_runs_on_resume(world, quiet, monkeypatch):
     monkeypatch.setattr(Trainer, "frame_psnrs", pressed)
     for _ in range(4):
         with pytest.raises(Cancelled):
-            train_shot(world.shot, short(world, "holed"), quiet())
+            train_shot(world.shot, short("holed"), quiet())
         assert iteration_of(world.shot.run("holed")) == goes_on[-1]
     report = quiet()
-    train_shot(world.shot, short(world, "holed"), report)
+    train_shot(world.shot, short("holed"), report)
     assert goes_on == [30, 30, 60, 60]
     curves = []
     for name in ("whole", "holed"):
@@ -307,10 +297,10 @@ def test_what_a_step_was_measured_at_is_not_measured_again_when_the_run_goes_on(
             self.cancelled = path.stem == "000030"
 
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short(world, "told"), Stops())
+        train_shot(world.shot, short("told"), Stops())
     assert iteration_of(world.shot.run("told")) == 30
     report = quiet()
-    train_shot(world.shot, short(world, "told"), report)
+    train_shot(world.shot, short("told"), report)
     rows = [
         json.loads(line)["iteration"]
         for line in (world.shot.run("told") / "metrics.jsonl").read_text().split("\n")[:-1]
@@ -320,27 +310,27 @@ def test_what_a_step_was_measured_at_is_not_measured_again_when_the_run_goes_on(
 
 
 def test_a_finished_run_that_begins_anew_stays_too(world, quiet):
-    train_shot(world.shot, short(world, "restarted"), quiet())
+    train_shot(world.shot, short("restarted"), quiet())
     run = world.shot.run("restarted")
     before = files_of(run)
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short(world, "restarted", resume=False), quiet(cancel_at=("training", 0.5)))
+        train_shot(world.shot, short("restarted", resume=False), quiet(cancel_at=("training", 0.5)))
     assert files_of(run) == before
-    train_shot(world.shot, short(world, "restarted"), quiet())
+    train_shot(world.shot, short("restarted"), quiet())
     assert not begun_in(run), "the finished run is what it could only come to"
 
 
 def test_a_training_that_was_begun_behind_a_link_is_not_gone_on_with(world, quiet, tmp_path):
     """A shot folder may come from anywhere, and a link in it may lead to another user's run."""
-    train_shot(world.shot, short(world, "linked"), quiet())
+    train_shot(world.shot, short("linked"), quiet())
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short(world, "linked", seed=5), quiet(cancel_at=("training", 0.5)))
+        train_shot(world.shot, short("linked", seed=5), quiet(cancel_at=("training", 0.5)))
     (work,) = begun_in(world.shot.run("linked"))
     theirs = work.rename(tmp_path / "theirs")
     before = files_of(theirs)
     work.symlink_to(theirs)
     with pytest.raises(JobError, match="is a link to"):
-        train_shot(world.shot, short(world, "linked", seed=5), quiet())
+        train_shot(world.shot, short("linked", seed=5), quiet())
     assert files_of(theirs) == before
 
 
@@ -348,12 +338,12 @@ def test_paused_runs_of_one_name_wait_side_by_side(world, quiet):
     """A short training with other settings must not delete hours of a paused run."""
     for seed in (1, 2, 3):
         with pytest.raises(Cancelled):
-            train_shot(world.shot, short(world, "paused", seed=seed), quiet(cancel_at=("training", 0.5)))
+            train_shot(world.shot, short("paused", seed=seed), quiet(cancel_at=("training", 0.5)))
     run = world.shot.run("paused")
     assert load_run(world.shot, "paused").config.seed == 1
     assert len(begun_in(run)) == 2
     report = quiet()
-    train_shot(world.shot, short(world, "paused", seed=2), report)
+    train_shot(world.shot, short("paused", seed=2), report)
     assert any(e[0] == "progress" and "resumed" in e[4] for e in report.events)
     assert load_run(world.shot, "paused").config.seed == 2
     assert not (run / "next").exists()
@@ -364,7 +354,7 @@ def test_kill_during_run_replacement_is_repaired(world, quiet, tmp_path):
     shot = Shot(shutil.copytree(world.shot.root, tmp_path / "s.splannequin", ignore=shutil.ignore_patterns("runs")))
     run, old, new = shot.run("main"), tmp_path / "old", tmp_path / "new"
     for seed, folder in ((0, old), (5, new)):
-        train_shot(shot, short(world, "main", seed=seed), quiet())
+        train_shot(shot, short("main", seed=seed), quiet())
         run.rename(folder)
     key, expected = json.loads((new / "summary.json").read_text())["key"], files_of(new)
     for moved in range(5):
@@ -376,7 +366,7 @@ def test_kill_during_run_replacement_is_repaired(world, quiet, tmp_path):
             (run / "next" / key / name).replace(run / name)
         assert load_run(shot, "main").config.seed == (5 if moved else 0), "it can be frozen from meanwhile"
         report = quiet()
-        train_shot(shot, short(world, "main", seed=5), report)
+        train_shot(shot, short("main", seed=5), report)
         assert ("progress", "training", 1, 1, "already trained") in report.events
         assert files_of(run) == expected
         assert not (run / "next").exists()
@@ -384,18 +374,15 @@ def test_kill_during_run_replacement_is_repaired(world, quiet, tmp_path):
 
 
 def test_cancelling_at_once_keeps_the_finished_checkpoint(world, quiet):
-    train_shot(world.shot, short(world, "kept"), quiet())
+    train_shot(world.shot, short("kept"), quiet())
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short(world, "kept", seed=5), quiet(cancel_at=("loading frames", 0.5)))
+        train_shot(world.shot, short("kept", seed=5), quiet(cancel_at=("loading frames", 0.5)))
     assert load_run(world.shot, "kept").config.seed == 0
 
 
 def test_run_of_a_different_solve_is_refused(tmp_path, quiet):
-    import sys
-
-    build_world = sys.modules[quiet.__module__].build_world
     world = build_world(tmp_path)
-    train_shot(world.shot, short(world, "main"), quiet())
+    train_shot(world.shot, short("main"), quiet())
     path = world.shot.solve / "cameras.json"
     path.write_text(path.read_text().replace("registered", "localised", 1))
     with pytest.raises(JobError, match="other cameras"):
@@ -404,9 +391,7 @@ def test_run_of_a_different_solve_is_refused(tmp_path, quiet):
 
 def test_run_of_different_pictures_is_refused_and_retrained(tmp_path, quiet):
     """Another grade of the same footage with imported cameras, whose files are identical byte by byte."""
-    import sys
-
-    world = sys.modules[quiet.__module__].build_world(tmp_path)
+    world = build_world(tmp_path)
     record = json.loads(world.shot.listing.read_text())
 
     def imported(key):
@@ -414,7 +399,7 @@ def test_run_of_different_pictures_is_refused_and_retrained(tmp_path, quiet):
 
     def trained():
         report = quiet()
-        train_shot(world.shot, short(world, "main"), report)
+        train_shot(world.shot, short("main"), report)
         return ("progress", "training", 1, 1, "already trained") not in report.events
 
     imported("as filmed")
@@ -424,13 +409,13 @@ def test_run_of_different_pictures_is_refused_and_retrained(tmp_path, quiet):
     with pytest.raises(JobError, match="other pictures"):
         load_run(world.shot, "main")
     with pytest.raises(JobError, match="other pictures"):
-        train_shot(world.shot, short(world, "main", extend=5), quiet())
+        train_shot(world.shot, short("main", extend=5), quiet())
     assert trained() and not trained() and load_run(world.shot, "main").stamp != before.stamp
 
 
 def test_a_run_is_known_by_its_content_whatever_the_time_of_its_file(world, quiet, tmp_path):
     """A disk may round modification times, and `cp -r` changes them."""
-    train_shot(world.shot, short(world, "timed"), quiet())
+    train_shot(world.shot, short("timed"), quiet())
     checkpoint = world.shot.run("timed") / CHECKPOINT_FILE
     run = load_run(world.shot, "timed")
     for time in (checkpoint.stat().st_mtime_ns // 100 * 100, 1):
@@ -450,12 +435,12 @@ def test_figures_are_not_appended_through_a_link(world, quiet, tmp_path):
     theirs.touch()
     folder.mkdir(parents=True)
     (folder / "metrics.jsonl").symlink_to(theirs)
-    train_shot(world.shot, short(world, "figures"), quiet())
+    train_shot(world.shot, short("figures"), quiet())
     assert not theirs.read_text() and not (folder / "metrics.jsonl").is_symlink()
 
 
 def test_damaged_checkpoint_is_an_error_in_words(world, quiet):
-    train_shot(world.shot, short(world, "damaged"), quiet())
+    train_shot(world.shot, short("damaged"), quiet())
     path = world.shot.run("damaged") / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(JobError, match="cannot be read"):

@@ -2,12 +2,12 @@
 
 import dataclasses
 import re
-import sys
 
 import numpy as np
 import pytest
 import torch
 
+from tests.backend.conftest import build_world
 from torch_backend.contract import TrainParams, read_json, verdict_lines
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.train import train_shot
@@ -145,12 +145,12 @@ def walk_through(shot):
 
 def test_run_reports_travel_distance(trained):
     """The small world's patch sways by 0.4 units at depth 3.2, which is more than people who hold still."""
-    world, summary = trained
-    places = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
+    summary = trained.summary
+    places = [trained.at(time)["means"][trained.moving][0] for time in (0.25, 0.75)]
     true = float((places[0] - places[1])[0]) * 60.0 / 3.2
     assert summary["travel_px"] == pytest.approx(true, rel=0.35)
     assert (summary["quality"], summary["quality_on"]) == ("Fair", "held-out frames")
-    kept = read_json(world.shot.run("main") / "summary.json")
+    kept = read_json(trained.shot.run("main") / "summary.json")
     assert kept["verdict"] == summary["verdict"] and summary["unexplained_share"] < 0.01
     match = re.search(r"(\d+) of 64 pixels", verdict_lines(kept)[1])
     assert match and float(match[1]) == pytest.approx(summary["farthest_px"], abs=0.56), "rounded once, and once more"
@@ -158,7 +158,7 @@ def test_run_reports_travel_distance(trained):
 
 @pytest.mark.parametrize("holdout", [8, 0])
 def test_person_walking_through_is_reported(tmp_path, quiet, holdout):
-    world = sys.modules[quiet.__module__].build_world(tmp_path)
+    world = build_world(tmp_path)
     params = TrainParams(iterations=200, max_gaussians=1500, holdout=holdout)
     walk_through(world.shot)
     report = quiet()

@@ -1,17 +1,20 @@
 """Frozen frames composited from the plates: splats give geometry, motion and occlusion; plates give the pixels.
 
 C is the frozen render of a camera at the instant t*. I_m is plate m. R_m is the model's render with the camera, time
-and exposure of plate m. A pixel x of the frozen frame is
+and exposure of plate m. p_m(x) is the pixel where plate m shows the surface point of x, after the model has moved the
+point from t* to m. A pixel x of the frozen frame is
 
-    out(x) = A(x) I_n(p_n(x)) + (1 - A(x)) (C(x) + b(x) sum_m w_m(x) (I_m - R_m)(p_m(x)) / sum_m w_m(x))
+    out = A I_n(p_n) + (1 - A) ((1 - c) (C + b sum_m w_m (I_m - R_m)(p_m) / sum_m w_m) + c I_t*(p_t*))
+    A = clip(1/2 - L / (2 s), 0, 1)        b = sum_m w_m / (sum_m w_m + doubt)
 
-n is the primary plate: the frame's own plate on the clip's poses, the plate nearest in pose on others. A is the matte
-of the primary plate. It is 1 where neither t* nor the plate shows anything moving, so a static scene reproduces the
-plate bit for bit. The remaining pixels are filled. p_m(x) is the pixel where plate m shows the surface point of x,
-after the model has moved the point from t* to m. The residual I_m - R_m adds what the model missed: texture, edges and
-light. Plate t* is trusted even where the model does not explain it, because it shows the frozen instant. Other plates
-are trusted where nothing moves or where they agree with the model. b fades to the splats alone where no plate is
-trusted. Residuals are added in display space, in which splats blend and highlights have a shoulder. A mixes
+n is the primary plate: the frame's own plate on the clip's poses, the plate nearest in pose on others. A is its matte:
+1 where it surely shows the state of t*. L are the smoothed log-odds of another state, s their softness (`state.py`).
+On the pose of t*, and on black bars, A is 1, so the plate is reproduced bit for bit. Off the clip's poses A also falls
+with occlusion and with the parallax of a depth error. The remaining pixels are filled. The residual I_m - R_m adds what
+the model missed: texture, edges and light. Plate t* is trusted even where the model does not explain it, because it
+shows the frozen instant. Other plates are trusted where nothing moves or where they agree with the model. b fades to
+the splats alone where no plate is trusted. c is the share of plate t*'s own pixels on movers that it shows from nearly
+the same side. Residuals are added in display space, in which splats blend and highlights have a shoulder. A mixes
 scene-linear light, so that artists can repeat the mix with their own plate.
 
 Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023, "DynIBaR"; figures: docs/benchmarks.md.
@@ -20,7 +23,7 @@ Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023,
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -40,15 +43,15 @@ from .config import CompositeConfig
 from .fill import Fillers, Filling, fill, fillers_of
 from .primary_source import PrimaryMatte, primary_matte, primary_plate
 from .transfer import to_display, to_linear
-from .warp import sample
+from .warp import MATTE_STEPS, sample
 
-_MIN_MATTE = 0.5 / 1024.0
-"""Largest matte that rounds to 0 in steps of 1/1024."""
+_MIN_MATTE = 0.5 / MATTE_STEPS
+"""Largest matte that rounds to 0."""
 
 
 @dataclass
 class CompositeFrame:
-    """One frozen frame composited from plates, on the CPU, with the overscan of the render."""
+    """One frozen frame composited from plates, on the model's device, with the overscan of the render."""
 
     linear: Tensor
     """[H, W, 3] premultiplied, scene-linear: matte * plate(st) + fill."""
@@ -78,11 +81,16 @@ class CompositeFrame:
     fill: Tensor
     """[H, W, 3] scene-linear, premultiplied by 1 - matte: the rest of the pixel."""
     display: Display = PLAIN
-    """Display of the colours in `splat` and `color`."""
+    """Transfer function (display encoding) of `splat` and `color`."""
     depth_sigma: Tensor | None = None
     """As in `FrozenImage`."""
     terms: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
     """Name -> [h, w] at decision resolution: evidence that chose the source of each pixel (`--debug-terms`)."""
+
+    def cpu(self) -> CompositeFrame:
+        """The frame on the CPU, for writing files; tensors that are there already are not copied."""
+        moved = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **moved, terms={name: term.cpu() for name, term in self.terms.items()})
 
     @property
     def color(self) -> Tensor:
@@ -135,7 +143,7 @@ class Compositor:
             width, height: pixels of the frame without overscan.
             withheld: frames whose plates must not be used.
         """
-        self._turn_to(frozen, output.t_star)
+        self._use_instant(frozen, output.t_star)
         target = target_view(self.source_views, output, frozen, image, width, height)
         usable = [frame for frame in self.source_views.frames if frame not in withheld]
         primary = primary_plate(self.source_views, output, target, usable)
@@ -158,14 +166,12 @@ class Compositor:
             return None
         (rows, columns), (height, width) = matte.shape, found.shape
         top, left = (rows - height) // 2, (columns - width) // 2
-        bars = torch.zeros(rows, columns, dtype=torch.bool, device="cpu")
-        bars[top : top + height, left : left + width] = from_numpy(found)
+        bars = torch.zeros_like(matte, dtype=torch.bool)
+        bars[top : top + height, left : left + width] = from_numpy(found).to(matte.device)
         matte[bars] = 1.0
         return bars
 
-    # ------------------------------------------------------------------------------------------------- the frame
-
-    def _turn_to(self, frozen: FrozenGaussians, t_star: float) -> None:
+    def _use_instant(self, frozen: FrozenGaussians, t_star: float) -> None:
         """Recreates `source_views` when the developed instant changes; frames of an instant come in sequence."""
         developed = frozen if frozen.descent is not None else None
         if developed is not self.source_views.stage.developed:
@@ -173,8 +179,6 @@ class Compositor:
             self.source_views = SourceViews(
                 self.run, self.scene, self.plates, self._moving, config, developed, round(t_star)
             )
-
-    # ------------------------------------------------------------------------------------------------- the mix
 
     def _mix_frame(
         self,
@@ -189,21 +193,21 @@ class Compositor:
         if len(parts) > 1:
             hand_back()
         has_primary = bool((matte > _MIN_MATTE).any())
-        plate = self.plates.linear(primary) if has_primary and not is_identity else None
+        plate = self.plates.linear(primary).to(matte.device) if has_primary and not is_identity else None
         composite = CompositeFrame(
-            torch.empty(rows, columns, 3, device="cpu"), image.alpha.clone(), image.color, image.alpha,
-            torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
-            torch.minimum(image.support, 1.0 - resized(target.out_of_view, columns, rows)),
-            resized(target.moved, columns, rows), primary, st, matte, torch.zeros(rows, columns, 3, device="cpu"),
-            self.scene.display,
+            linear=torch.empty_like(image.color), alpha=image.alpha.clone(), splat=image.color,
+            splat_alpha=image.alpha, plate=torch.empty_like(image.alpha), source=torch.empty_like(image.alpha),
+            depth=image.depth, support=torch.minimum(image.support, 1.0 - resized(target.out_of_view, columns, rows)),
+            motion=resized(target.moved, columns, rows), primary=primary, st=st, matte=matte,
+            fill=torch.zeros_like(image.color), display=self.scene.display,
             terms={**primary_part.terms, **_terms(target, fillers)},
         )  # fmt: skip
         for band in parts:
             filling = None if fillers is None else fill(self.source_views, self.config, target, fillers, matte, band)
-            matte[band] = (matte[band] * 1024.0).round() / 1024.0
+            matte[band] = (matte[band] * MATTE_STEPS).round() / MATTE_STEPS
             lead = sample(plate, st[band]) if plate is not None else None
             if has_primary and is_identity:
-                lead = self._placed(primary, rows, columns, band)
+                lead = self._placed(primary, rows, columns, band).to(matte.device)
             self._mix_rows(composite, filling, lead, band)
         return composite
 

@@ -9,14 +9,15 @@ from torch import Tensor
 
 from ...torch_types import norm
 from ..views.decisions import above, first_best
-from ..views.reproject import blurred, dilate, erode, look_up, look_up_near, project, resized, unproject
+from ..views.reproject import blurred, dilate, erode, look_up, look_up_near, pair, project, resized, unproject
 from ..views.source_views import SourceViews
 from ..views.target_view import TargetView, displacements, parallax
 from ..views.visibility import Visibility
 from .config import CompositeConfig
+from .warp import MATTE_STEPS
 
-FULL_MATTE = 1.0 - 0.5 / 1024.0
-"""Matte above which rounding to 1024 steps gives 1, so that the pixel comes from the primary plate alone."""
+FULL_MATTE = 1.0 - 0.5 / MATTE_STEPS
+"""Matte above which rounding gives 1, so that the pixel comes from the primary plate alone."""
 _ROUGH = 1
 """Radius, in pixels at decision resolution, of the surroundings that a plate must also show to fill a pixel near a
 mover. Depth is rough near movers, so visibility changes from pixel to pixel, and single pixels would stand out."""
@@ -126,7 +127,8 @@ def fill(
     at = (matte[rows] < FULL_MATTE).nonzero()
     y, x = at[:, 0], at[:, 1]
     count = len(at)
-    share, source = (torch.zeros(count, device="cpu") for _ in range(2))
+    device = matte.device
+    share, source = (torch.zeros(count, device=device) for _ in range(2))
     filling = Filling(y, x, target.image.color[rows][y, x], share, source)
     if not count:
         return filling
@@ -134,14 +136,12 @@ def fill(
     small = pixels * target.per_pixel
     points = unproject(pixels, target.image.depth[rows][y, x], target.viewmat, target.K)
     motion = look_up(target.motion, small)
-    larger = torch.tensor(
-        [source_views.plates.width / source_views.size[0], source_views.plates.height / source_views.size[1]],
-        device="cpu",
-    )
+    plates, (w, h) = source_views.plates, source_views.size
+    larger = pair(plates.width / w, plates.height / h, pixels)
     doubt = look_up(target.doubt, small)
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
-    same_state, untold = torch.zeros(count, device="cpu"), torch.ones(count, device="cpu")
+    same_state, untold = torch.zeros(count, device=device), torch.ones(count, device=device)
     truth = source_views.seen(target.t, points) if target.t in fillers.chosen else None
     if truth is not None:  # the better plate t* shows a pixel, the less other times are needed
         untold = 1.0 - _near(source_views, config, target, target.t, truth)
@@ -162,8 +162,8 @@ def fill(
         weights.append(_weight(source_views, config, target, frame, visibility, motion, sway, still))
         places.append(visibility.pixels * larger)
     believed = torch.stack(weights)
-    filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[first_best(believed)]
-    total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
+    filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device=device)[first_best(believed)]
+    total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device=device)
     filling.share = total / (total + config.doubt)
     for n, residual in enumerate(fillers.residuals):
         carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n])
@@ -205,7 +205,8 @@ def _take_instant(
 
 def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetView, points: Tensor) -> Tensor:
     """[...] in 0..1: similarity of the viewing directions of plate t* and the frame at points [..., 3]."""
-    a, b = points - source_views.centres[source_views.index[target.t]], points - target.centre
+    theirs = source_views.centres[source_views.index[target.t]]
+    a, b = (points - centre.to(points.device) for centre in (theirs, target.centre))
     cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
     angle = torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
     return (2.0 - 2.0 * angle / config.max_mover_angle).clamp(0.0, 1.0)
@@ -215,9 +216,9 @@ def _exposed(source_views: SourceViews, target: TargetView, frame: int) -> tuple
     """(gain [3], offset [3]) that convert the exposure of a plate to the exposure of the target frame."""
     exposure = source_views.run.model.exposure
     if not exposure.config.on:
-        return torch.ones(3, device="cpu"), torch.zeros(3, device="cpu")
+        return target.points.new_ones(3), target.points.new_zeros(3)
     theirs, ours = source_views.scene.time_of_frame(frame), target.exposed_at
-    (gain, offset), (our_gain, our_offset) = ([part.detach().cpu() for part in exposure.at(t)] for t in (theirs, ours))
+    (gain, offset), (our_gain, our_offset) = ([part.detach() for part in exposure.at(t)] for t in (theirs, ours))
     return our_gain / gain, our_offset - offset * our_gain / gain
 
 
@@ -296,14 +297,11 @@ def _chosen(
         have = have + gains[frame]
     while len(chosen) < min(config.sources, len(gains)):
         # Square root: a second plate of the same wall helps less than a first plate of another wall.
-        remaining = {frame: gain for frame, gain in gains.items() if frame not in chosen}
-        benefit = {frame: float(((have + gain).sqrt() - have.sqrt()).sum()) for frame, gain in remaining.items()}
-        candidates = sorted(benefit, key=lambda candidate: abs(candidate - primary))
-        frame = candidates[
-            int(first_best(torch.tensor([benefit[candidate] for candidate in candidates], device="cpu")))
-        ]
-        if benefit[frame] <= 0.0:
+        candidates = sorted((frame for frame in gains if frame not in chosen), key=lambda frame: abs(frame - primary))
+        benefit = torch.stack([((have + gains[frame]).sqrt() - have.sqrt()).sum() for frame in candidates]).cpu()
+        best = int(first_best(benefit))
+        if float(benefit[best]) <= 0.0:
             break
-        chosen.append(frame)
-        have = have + gains[frame]
+        chosen.append(candidates[best])
+        have = have + gains[candidates[best]]
     return chosen

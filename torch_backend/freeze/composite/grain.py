@@ -18,12 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...footage.color import srgb_to_linear
 from ...footage.display import PLAIN, Display
 from ...footage.images import read_frame
+from ...kernel_text import kernel_text
+from ...native import INTEGER, POINTER, Snippet
 from ...scene import evenly_spaced
 
 BINS = 8
@@ -40,6 +42,7 @@ _OUTLIER = 3.0
 may be this many times the median of all levels. Beyond that, the picture's texture is taken to be the cause."""
 _MOST = 0.08
 """Deviation, display-referred, above which a level is always rejected as texture."""
+_KERNEL = Path(__file__).with_name("kernels") / "grain.cpp"
 _SOFTNESS = np.arange(0.0, 2.01, 0.05)
 
 
@@ -126,8 +129,9 @@ def draw(grain: Grain, frame: int, rgba: NDArray[Any], size: tuple[int, int]) ->
     Returns:
         [H, W, 3] scene-linear, premultiplied by the frame's alpha. Its mean is 0 except where black or white clips it.
     """
+    rgba = np.asarray(rgba, np.float32)
     brush = Brush(grain, frame, rgba.shape[:2], size)
-    return brush.rows(slice(0, len(rgba)), rgba)
+    return brush.rows(slice(0, len(rgba)), rgba[..., :3], rgba[..., 3], np.ones(rgba.shape[:2], np.float32))
 
 
 class Brush:
@@ -135,25 +139,50 @@ class Brush:
 
     def __init__(self, grain: Grain, frame: int, shape: tuple[int, ...], size: tuple[int, int]) -> None:
         """`shape` is [H, W] of the whole picture; the rest as for `draw`."""
-        self._grain, (self._height, self._width) = grain, shape
+        self._deviation, self._shape = np.ascontiguousarray(grain.deviation, np.float32), shape
         self._noise = _noise(grain, frame, size) if grain.deviation.any() else None
-        if self._noise is not None and self._noise.shape[0] > self._height:
-            self._noise = _resized(self._noise, 0, self._height)
+        for axis in (0, 1):
+            if self._noise is not None and self._noise.shape[axis] > shape[axis]:
+                self._noise = _shrunk(self._noise, axis, shape[axis])
 
-    def rows(self, rows: slice, rgba: NDArray[Any]) -> NDArray[np.float32]:
-        """[h, W, 3] grain as from `draw`, for `rgba` [h, W, 4], which are these rows of the picture."""
+    def rows(
+        self, rows: slice, color: NDArray[Any], alpha: NDArray[Any], share: NDArray[Any], is_light: bool = False
+    ) -> NDArray[np.float32]:
+        """Grain of some rows of the picture, as from `draw`.
+
+        Args:
+            rows: the rows.
+            color: [h, W, 3] their colour, premultiplied: display-referred, or scene-linear with `is_light`.
+            alpha: [h, W] their alpha.
+            share: [h, W] factor for the grain.
+
+        Returns:
+            [h, W, 3] scene-linear, premultiplied.
+        """
         if self._noise is None:
-            return np.zeros((*rgba.shape[:2], 3), np.float32)
-        noise = _resized(self._noise, 0, self._height, rows)
-        noise = _resized(noise, 1, self._width)
-        alpha = rgba[..., 3:4]
-        color = np.clip(rgba[..., :3] / np.where(alpha > 0.0, alpha, 1.0), 0.0, 1.0).astype(np.float32)
-        middles = (np.arange(BINS) + 0.5) / BINS
-        deviation = self._grain.deviation
-        curves = [np.asarray(np.interp(color[..., c], middles, deviation[c]), np.float64) for c in range(3)]
-        response = np.stack(curves, axis=-1)
-        grainy = np.clip(color + response * noise, 0.0, 1.0)
-        return ((srgb_to_linear(grainy) - srgb_to_linear(color)) * alpha).astype(np.float32)
+            return np.zeros(color.shape, np.float32)
+        color, alpha, share, noise = (np.ascontiguousarray(a, np.float32) for a in (color, alpha, share, self._noise))
+        out, shoulder = np.empty_like(color), np.zeros(2, np.float32)
+        _snippet().run(
+            color=color.ctypes.data, alpha=alpha.ctypes.data, share=share.ctypes.data, noise=noise.ctypes.data,
+            curve=self._deviation.ctypes.data, out=out.ctypes.data, shoulder=shoulder.ctypes.data,
+            height=color.shape[0], width=color.shape[1], noise_height=noise.shape[0], noise_width=noise.shape[1],
+            top=rows.start, whole=self._shape[0], is_light=is_light, bends=0,
+        )  # fmt: skip
+        return out
+
+
+@functools.cache
+def _snippet() -> Snippet:
+    pointers = ("color", "alpha", "share", "noise", "curve", "out", "shoulder")
+    sizes = ("height", "width", "noise_height", "noise_width", "top", "whole", "is_light", "bends")
+    fields = {**dict.fromkeys(pointers, POINTER), **dict.fromkeys(sizes, INTEGER)}
+    return Snippet("grain", fields, kernel_text(_KERNEL).replace("@BINS@", str(BINS)))
+
+
+def warm_up() -> None:
+    """Compiles the kernel, or loads it from the cache. Call this from the main thread."""
+    _snippet().warm_up()
 
 
 def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float32]:
@@ -163,34 +192,22 @@ def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float3
     reach = len(kernel) // 2
     generator = np.random.default_rng(frame % 2**32)
     white = generator.standard_normal((height + 2 * reach, width + 2 * reach, 3), dtype=np.float32)
-    rows = np.sum([w * white[i : i + height] for i, w in enumerate(kernel)], axis=0)
-    soft = np.sum([w * rows[:, i : i + width] for i, w in enumerate(kernel)], axis=0)
+    soft = cv2.sepFilter2D(white, -1, kernel, kernel)[reach : reach + height, reach : reach + width]
     values, axes = np.linalg.eigh(grain.correlation.astype(np.float64))
     root = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T
-    return np.asarray(soft @ root.astype(np.float32), np.float32)
+    return np.asarray(soft.reshape(-1, 3) @ root.astype(np.float32), np.float32).reshape(height, width, 3)
 
 
-def _resized(noise: NDArray[np.float32], axis: int, length: int, part: slice = slice(None)) -> NDArray[np.float32]:
-    """`noise` resized to `length` pixels along an axis, or a `part` of that: averaged if smaller, else interpolated."""
+def _shrunk(noise: NDArray[np.float32], axis: int, length: int) -> NDArray[np.float32]:
+    """`noise` averaged to fewer pixels along an axis."""
     before = noise.shape[axis]
-    along = [-1 if n == axis else 1 for n in range(3)]
-    if before == length:
-        return noise[part] if axis == 0 else noise[:, part]
-    if length > before:
-        at = (np.arange(length, dtype=np.float64)[part] + 0.5) * before / length - 0.5
-        at = np.asarray(np.clip(at, 0.0, before - 1.0), np.float64)
-        low = np.minimum(at.astype(int), max(before - 2, 0))
-        share = (at - low).reshape(along).astype(np.float32)
-        blended = noise.take(low, axis) * (1.0 - share) + noise.take(np.minimum(low + 1, before - 1), axis) * share
-        return np.asarray(blended, np.float32)
     # Differences of the integral at the edges of the new pixels are exact means.
     total = np.concatenate([np.zeros_like(noise.take([0], axis)), np.cumsum(noise, axis, dtype=np.float64)], axis)
     at = np.asarray(np.linspace(0.0, before, length + 1), np.float64)
     low = np.minimum(at.astype(int), before - 1)
-    share = (at - low).reshape(along)
+    share = (at - low).reshape([-1 if n == axis else 1 for n in range(3)])
     edges = total.take(low, axis) * (1.0 - share) + total.take(low + 1, axis) * share
-    shrunk = np.asarray(np.diff(edges, axis=axis) * (length / before), np.float32)
-    return shrunk[part] if axis == 0 else shrunk[:, part]
+    return np.asarray(np.diff(edges, axis=axis) * (length / before), np.float32)
 
 
 def _kernel(softness: float) -> NDArray[np.float32]:

@@ -98,7 +98,7 @@ class MeasuredDepths:
             return None
         i, (height, width) = scene.frames.index(frame), found.shape[1:]
         K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
-        image = render_frozen(frozen, scene.viewmats[i], K, width, height)
+        image = render_frozen(frozen, scene.viewmats[i], K, width, height).cpu()
         splats = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
         inverse, sigma = found.numpy()
         has_depth = inverse > 0

@@ -12,11 +12,11 @@ from ...torch_types import norm
 from ..bands import bands
 from ..frozen import SUPPORT_SECONDS, OutputFrame
 from ..views.decisions import above, first_least
-from ..views.reproject import pixel_centres, project, resized, unproject
+from ..views.reproject import pair, pixel_centres, project, resized, unproject
 from ..views.source_views import SourceViews
 from ..views.target_view import TargetView, parallax
 from .config import CompositeConfig
-from .state import Evidence, evidence, let_go, log_odds
+from .state import Evidence, evidence, log_odds, rejection
 from .warp import snap
 
 
@@ -47,7 +47,7 @@ def primary_plate(source_views: SourceViews, output: OutputFrame, target: Target
     solid = target.depth[target.depth < 1e9]
     depth = float(solid.median()) if len(solid) else 1.0
     travel = norm(source_views.centres[at] - target.centre, 1) / max(depth, 1e-6)
-    turned = 1.0 - source_views.scene.viewmats[at][:, 2, :3] @ target.viewmat[2, :3]
+    turned = 1.0 - source_views.scene.viewmats[at][:, 2, :3] @ output.viewmat[2, :3]
     return usable[first_least([float(value) for value in travel + turned], 1e-5)]
 
 
@@ -70,10 +70,11 @@ def primary_matte(
     lead = source_views.seen(primary, target.points)
     is_clip_view = target.is_clip_view
     truth = source_views.seen(target.t, target.points) if target.t in usable else None
+    # Where plate t* does not show a point, model and own plate must agree that it moves.
     hidden = torch.minimum(target.motion, lead.moving) if is_clip_view else target.motion
     if truth is not None:
         target.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
-    else:
+    else:  # without plate t* nothing shows the movers of the instant, so that one of them is enough
         target.motion = torch.maximum(target.motion, lead.moving) if is_clip_view else target.motion
     target.moved = target.motion
     target.out_of_view = _out_of_view(
@@ -81,7 +82,7 @@ def primary_matte(
     )
     st, within = _places(source_views, target, primary, is_clip_view, size)
     if is_clip_view and primary != output.frame:  # its own plate is withheld
-        return PrimaryMatte(torch.zeros(rows, columns, device="cpu"), st, is_clip_view)
+        return PrimaryMatte(torch.zeros_like(target.image.alpha), st, is_clip_view)
     free = _free(source_views, target, primary) if is_clip_view else None
     if is_clip_view and primary == output.t_star:  # its own plate shows the instant itself
         if free is not None:
@@ -90,7 +91,7 @@ def primary_matte(
         return PrimaryMatte(within, st, is_clip_view)
     of = evidence(source_views, target, primary, lead, truth, config.state)
     odds = log_odds(of, config.state, source_views.unit)
-    target.doubt = let_go(odds, config.state)
+    target.doubt = rejection(odds, config.state)
     matte = 1.0 - target.doubt
     if is_clip_view:
         if free is not None:
@@ -114,7 +115,7 @@ def _out_of_view(source_views: SourceViews, target: TargetView, moving: Tensor, 
     moving = moving * above(moving, 0.5)
     at = moving > 0.0
     points = target.points[at]
-    known = torch.zeros(len(points), device="cpu")
+    known = points.new_zeros(len(points))
     t_star = float(source_views.scene.seconds[source_views.index[target.t]])
     for offset in (0.0, -0.5 * SUPPORT_SECONDS, 0.5 * SUPPORT_SECONDS) if len(points) else ():
         near = min(seconds, key=lambda frame: abs(seconds[frame] - t_star - offset))
@@ -142,17 +143,18 @@ def _places(
 
     ST is the identity if `is_clip_view`, that is, on the clip's own poses.
     """
-    rows, columns = target.image.alpha.shape
+    (rows, columns), device = target.image.alpha.shape, target.image.alpha.device
     if is_clip_view:
-        x = (torch.arange(columns, device="cpu") + 0.5 - (columns - size[0]) // 2) / size[0]
-        y = (torch.arange(rows, device="cpu") + 0.5 - (rows - size[1]) // 2) / size[1]
+        x = (torch.arange(columns, device=device) + 0.5 - (columns - size[0]) // 2) / size[0]
+        y = (torch.arange(rows, device=device) + 0.5 - (rows - size[1]) // 2) / size[1]
         share = torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1)
     else:
-        viewmat, K = source_views.camera(primary, source_views.plates.width, source_views.plates.height)
-        plate_size = torch.tensor([source_views.plates.width, source_views.plates.height], device="cpu")
-        share = torch.empty(rows, columns, 2, device="cpu")
+        size_of_plate = source_views.plates.width, source_views.plates.height
+        viewmat, K = (part.to(device) for part in source_views.camera(primary, *size_of_plate))
+        plate_size = pair(*size_of_plate, target.points)
+        share = torch.empty(rows, columns, 2, device=device)
         for band in bands(rows, columns):
-            pixels = pixel_centres(columns, band.stop - band.start)
+            pixels = pixel_centres(columns, band.stop - band.start, device)
             pixels[..., 1] += band.start
             points = unproject(pixels, target.image.depth[band], target.viewmat, target.K)
             share[band] = project(points, viewmat, K)[0] / plate_size

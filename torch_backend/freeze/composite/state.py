@@ -1,9 +1,10 @@
-"""Posterior probability that a pixel of a plate shows another state of the scene than the instant t*.
+"""Log-odds that a pixel of a plate shows another state of the scene than the instant t*.
 
-The log-odds of each pixel are a weighted sum of evidence (logistic regression): motion mattes, the model's scene flow,
-and differences between the plate, the frozen render and plate t*, in units of noise.
+They are a weighted sum of evidence (logistic regression): motion mattes, the model's scene flow, and differences
+between the plate, the frozen render and plate t*, in units of noise. A low-pass and a ramp make a matte of them.
 `python -m benchmarks.fit_state` fits all weights on synthetic scenes with ground truth. Its objective has two terms:
 the squared error of the plate's pixel compared with that of the fill, and whether the plate differs from ground truth.
+The bias is then chosen by the PSNR of smoothed, mixed frames, so the log-odds are not calibrated probabilities.
 
 Related: Granados et al. 2012, "Background Inpainting for Videos with Dynamic Objects and a Free-moving Camera", also
 choose between plates by an expected error.
@@ -105,11 +106,12 @@ def evidence(
 def log_odds(of: Evidence, config: StateConfig, unit: float) -> Tensor:
     """[h, w] log-odds that a plate shows another state than t*. `unit`: as `SourceViews.unit`."""
     weights = {f.name: float(getattr(config.weights, f.name)) for f in fields(StateWeights)}
-    total = sum((weights[name] * value for name, value in of.items()), torch.tensor(weights["bias"], device="cpu"))
+    bias = torch.full_like(of["change"], weights["bias"])
+    total = sum((weights[name] * value for name, value in of.items()), bias)
     return blurred(total, config.smoothing * unit)
 
 
-def let_go(odds: Tensor, config: StateConfig) -> Tensor:
+def rejection(odds: Tensor, config: StateConfig) -> Tensor:
     """[h, w] in 0..1: share of each pixel that is not taken from the plate, given log-odds [h, w]."""
     return (0.5 + 0.5 * odds / config.softness).clamp(0.0, 1.0)
 

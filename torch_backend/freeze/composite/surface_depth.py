@@ -430,7 +430,7 @@ class FrameDepths:
         width = min(self.config.width, scene.width)
         height = max(8, round(scene.height * width / scene.width))
         K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
-        image = render_frozen(still, scene.viewmats[i], K, width, height)
+        image = render_frozen(still, scene.viewmats[i], K, width, height).cpu()
         inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
         plate = read_image(shot.plate(frame), width, height, scene.display).numpy()
         moving = load_motion(shot, frame)

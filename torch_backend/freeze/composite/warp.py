@@ -37,6 +37,7 @@ from ...contract import UserError
 from ...footage.color import LIGHTS, in_light, light_matrix
 from ...torch_types import from_numpy
 from ..exr import check_finite, linear_spec, read_layers, read_light, set_margin, write_exr
+from ..views.reproject import pair
 
 CHANNELS = ("R", "G", "B", "A", "ST.X", "ST.Y", "ST.Z", "Matte.V")
 """Channels of the fill, the frame's alpha, ST (s, t and 1) and the matte."""
@@ -44,6 +45,8 @@ WARP_VERSION = 1
 """Version of the `splannequin:` attributes of a warp."""
 STEPS = 256
 """Number of coordinate steps per pixel."""
+MATTE_STEPS = 1024.0
+"""Number of steps of a matte from 0 to 1. Half floats store them exactly, so that matte and fill match in a file."""
 
 _FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) * 3 + (oiio.HALF,)
 _ROWS = 256
@@ -90,7 +93,7 @@ class Warp:
 
 def snap(st: Tensor, plate_size: tuple[int, int]) -> Tensor:
     """ST [H,W,2] over a plate of (width, height), rounded to multiples of 1/`STEPS` of a pixel; float32."""
-    size = torch.tensor(plate_size, dtype=torch.float64, device=st.device)
+    size = pair(*plate_size, st.new_empty(0, dtype=torch.float64))
     out = torch.empty(st.shape, dtype=torch.float32, device=st.device)
     for top in range(0, st.shape[0], _ROWS):
         rows = st[top : top + _ROWS].double()

@@ -62,7 +62,7 @@ def with_missing(
     unit, moves = width / LENGTHS_OF, frozen.motion > 0.5
 
     def rendered(scene: FrozenGaussians) -> FrozenImage:
-        return render_frozen(scene, viewmat, K, width, height, run.model.exposure, time)
+        return render_frozen(scene, viewmat, K, width, height, run.model.exposure, time).cpu()
 
     # A moving Gaussian is a floater if plate t* contradicts most of its visible contribution. It could be mistaken for
     # the surface that a hand is attached to, and the hand would be placed too near.

@@ -107,7 +107,7 @@ def deep_samples(
         part = _part(frozen, (z > near) & (z <= far))
         if not len(part.support):
             continue
-        image = render_frozen(part, output.viewmat, K, width, height, exposure, exposed_at, beyond)
+        image = render_frozen(part, output.viewmat, K, width, height, exposure, exposed_at, beyond).cpu()
         at = (image.depth > between).long()[None]
         rgba = from_numpy(display.premultiplied_to_light(torch.cat([image.color, image.alpha[..., None]], 2).numpy()))
         weight.scatter_add_(0, at, (transmittance * image.alpha)[None])

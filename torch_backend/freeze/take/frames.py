@@ -16,7 +16,7 @@ from ...contract import (
     TakeFolder,
 )
 from ...footage.color import in_light, light_matrix, on_straight_colour
-from ...footage.display import PLAIN, Display
+from ...footage.display import Display
 from ...footage.images import write_png
 from ...scene import Scene
 from ...shot import disk_error, is_disk_full, need_disk
@@ -24,7 +24,7 @@ from ...torch_types import from_numpy
 from ..bands import bands
 from ..composite.compositor import CompositeFrame
 from ..composite.grain import Brush, Grain
-from ..composite.transfer import to_display
+from ..composite.transfer import straight_to_linear, to_display
 from ..composite.warp import WarpMetadata, write_warp
 from ..deep_exr import write_deep_exr
 from ..exr import DetailLayers, FrameMetadata, LazyLayer, write_frozen_exr
@@ -116,10 +116,11 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
 def _composited(
     output: OutputFrame, frozen: FrozenGaussians, scene: Scene, spec: FrameSpec
 ) -> tuple[FrozenImage, FrozenImage | CompositeFrame]:  # fmt: skip
-    """(the splats' render, the frame) of one camera; both are the same without plate detail."""
+    """(the splats' render, the frame) of one camera, on the CPU; both are the same without plate detail."""
     exposed_at, K = scene.time_of_frame(output.exposed_like), whole_camera(output, spec)
     image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
-    return image, image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+    frame = image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+    return image.cpu(), frame.cpu()
 
 
 def _blur(
@@ -291,18 +292,18 @@ def _grain(
     blur: MotionBlur | None = None if spec.blur is None or spec.blur.is_still(output) else spec.blur
 
     def layer_rows(rows: slice) -> np.ndarray:
-        colour = to_display(image.linear[rows], PLAIN) if isinstance(image, CompositeFrame) else image.color[rows]
-        rgba = torch.cat([colour, image.alpha[rows][..., None]], dim=2).numpy()
-        if display.bends and not isinstance(image, CompositeFrame):
-            rgba = on_straight_colour(rgba, lambda x: display.straightened(np.asarray(x, np.float32)))
-        noise = brush.rows(rows, rgba)
-        if isinstance(image, CompositeFrame):  # plates already have grain
-            lacking = 1.0 - image.plate[rows]
-            if blur is not None:  # motion blur averages part of the plates' grain away; variances add up
-                lengths = blur.lengths(output, K, image.depth[rows], rows.start)
-                lacking = (1.0 - kept_grain(lengths, softness).float() * (1.0 - lacking.square())).sqrt()
-            noise = noise * lacking.numpy()[..., None]
-        return noise
+        alpha = image.alpha[rows]
+        if not isinstance(image, CompositeFrame):
+            colour = image.color[rows].numpy()
+            if display.bends:
+                rgba = np.concatenate([colour, alpha[..., None].numpy()], axis=2)
+                colour = on_straight_colour(rgba, lambda x: display.straightened(np.asarray(x, np.float32)))[..., :3]
+            return brush.rows(rows, colour, alpha.numpy(), np.ones(alpha.shape, np.float32))
+        lacking = 1.0 - image.plate[rows]  # plates already have grain
+        if blur is not None:  # motion blur averages part of the plates' grain away; variances add up
+            lengths = blur.lengths(output, K, image.depth[rows], rows.start)
+            lacking = (1.0 - kept_grain(lengths, softness).float() * (1.0 - lacking.square())).sqrt()
+        return brush.rows(rows, image.linear[rows].numpy(), alpha.numpy(), lacking.numpy(), is_light=True)
 
     return LazyLayer((*image.alpha.shape, 3), layer_rows)
 
@@ -355,6 +356,5 @@ def scene_linear(color: np.ndarray, alpha: np.ndarray, display: Display) -> np.n
     Splats blend in display space. The colour is therefore divided by alpha before the conversion.
     """
     # Colour above the brightest value of the clip was not supervised in training. It is noise, which the shoulder's
-    # inverse would amplify many times.
-    capped = np.clip(color, 0.0, alpha[..., None] * np.float32(display.most))
-    return display.premultiplied_to_light(np.concatenate([capped, alpha[..., None]], axis=2))
+    # inverse would amplify many times. The conversion therefore limits colours to `Display.most`.
+    return straight_to_linear(from_numpy(color), from_numpy(alpha), display).numpy()

@@ -19,7 +19,7 @@ _SHARPEST = 1e-4
 
 def above(value: Tensor | float, threshold: Tensor | float) -> Tensor:
     """Soft `value > threshold` in 0..1, for a threshold of 0 or more: a ramp of +-`MARGIN` * threshold around it."""
-    value = torch.as_tensor(value, device="cpu")
+    value = value if isinstance(value, Tensor) else torch.tensor(value, device="cpu")
     # Another instruction set or picture size changes floats by 1e-7. At a hard threshold, a pixel would switch plates.
     width = 2.0 * MARGIN * threshold
     width = width.clamp_min(_SHARPEST) if isinstance(width, Tensor) else max(width, _SHARPEST)

@@ -28,6 +28,13 @@ def pixel_centres(width: int, height: int, device: torch.device | str = "cpu") -
     return torch.stack([x, y], dim=-1)
 
 
+def pair(x: float, y: float, like: Tensor) -> Tensor:
+    """[2] the values x and y, of the type and device of `like`, made without a copy for which a card would wait."""
+    values = like.new_full((2,), x)
+    values[1].fill_(y)
+    return values
+
+
 def unproject(pixels: Tensor, depth: Tensor, viewmat: Tensor, K: Tensor) -> Tensor:
     """World points [..., 3] at pixels [..., 2] and depth [...] of a camera (viewmat [4, 4], K [3, 3])."""
     focal, centre = torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
@@ -51,7 +58,7 @@ def look_up(picture: Tensor, pixels: Tensor, mode: str = "bilinear") -> Tensor:
     mode: bilinear, bicubic (sharper, may overshoot) or nearest.
     """
     flat = picture[..., None] if picture.ndim == 2 else picture
-    size = torch.tensor([flat.shape[1], flat.shape[0]], dtype=pixels.dtype, device=pixels.device)
+    size = pair(flat.shape[1], flat.shape[0], pixels)
     # Clamped, because points behind the camera have pixels of -1e6.
     at = (pixels / size * 2.0 - 1.0).reshape(1, -1, 1, 2).clamp(-4.0, 4.0)
     found = F.grid_sample(
@@ -63,7 +70,7 @@ def look_up(picture: Tensor, pixels: Tensor, mode: str = "bilinear") -> Tensor:
 
 def inside(pixels: Tensor, width: int, height: int, soft: float) -> Tensor:
     """[...] in 0..1: 0 outside a picture, rising to 1 over `soft` pixels inside its border."""
-    size = torch.tensor([width, height], dtype=pixels.dtype, device=pixels.device)
+    size = pair(width, height, pixels)
     border = torch.minimum(pixels, size - pixels).amin(dim=-1)
     return (border / soft).clamp(0.0, 1.0)
 
@@ -127,15 +134,15 @@ def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:
     The result equals `look_up` up to rounding of the coordinates, about 1e-4 pixels.
     """
     height, width = picture.shape[:2]
-    if height * width <= BAND_PIXELS or not pixels.numel():
+    # A card converts a picture faster than the host learns which rows are needed.
+    if height * width <= BAND_PIXELS or not pixels.numel() or picture.device.type != "cpu":
         return look_up(picture, pixels, "bicubic")
     least, most = (float(y) for y in torch.aminmax(pixels[..., 1]))
     if not (math.isfinite(least) and math.isfinite(most)):
         return look_up(picture, pixels, "bicubic")
     top = min(max(0, math.floor(least) - _REACH), height - 1)
     bottom = max(min(height, math.ceil(most) + _REACH), top + 1)
-    down = torch.tensor([0.0, float(top)], dtype=pixels.dtype, device=pixels.device)
-    return look_up(picture[top:bottom], pixels - down, "bicubic")
+    return look_up(picture[top:bottom], pixels - pair(0.0, top, pixels), "bicubic")
 
 
 def beyond(picture: Tensor, reference: Tensor, reach: int) -> Tensor:

@@ -137,10 +137,12 @@ class SourceViews:
         """Pixels at decision resolution per pixel at width `LENGTHS_OF`."""
         self.stage = MovingScene(run, scene, frozen, t_star)
         """The model in every frame."""
-        self.rows = self.stage.rows.cpu()
+        self.rows = self.stage.rows
+        self.device = run.model.device
+        """Where pictures are compared and frames composited; cameras and plates as they are read lie on the CPU."""
         views = scene.viewmats
         self.centres = -torch.einsum("nji,nj->ni", views[:, :3, :3], views[:, :3, 3])
-        """[F, 3] camera centres of the clip's frames, scene units."""
+        """[F, 3] camera centres of the clip's frames, scene units, on the CPU."""
         self._views: OrderedDict[int, PlateView] = OrderedDict()
         self._residuals: OrderedDict[int, Tensor] = OrderedDict()
         self._displayed: tuple[int, Tensor] | None = None
@@ -180,7 +182,7 @@ class SourceViews:
     def displayed(self, frame: int) -> Tensor:
         """[H, W, 3] float16: plate `frame`, display-referred, not clipped. The last plate is cached."""
         if self._displayed is None or self._displayed[0] != frame:
-            self._displayed = frame, self.plates.display(frame).half()
+            self._displayed = frame, self.plates.display(frame).to(self.device).half()
         return self._displayed[1]
 
     def most(self, frame: int) -> float:
@@ -213,15 +215,15 @@ class SourceViews:
         rendered = self.view(frame).rendered
         if rendered is None:
             rendered = self._render(frame, round(width * fine), max(8, round(height * fine)))[1].color
-        plate = self.plates.display(frame)
+        plate = self.plates.display(frame).to(self.device)
         self._most[frame] = float(plate.max())
-        out = torch.empty(height, width, 3, dtype=torch.float16, device="cpu")
+        out = torch.empty(height, width, 3, dtype=torch.float16, device=self.device)
         ignored = self.view(frame).ignored
         if fine == 1.0 and ignored is None:
             return torch.sub(plate, rendered).half()
         for top in range(0, height, _ROWS):  # a second picture of 4K would be another 100 MB
             rows = plate[top : top + _ROWS]
-            at = pixel_centres(width, len(rows))
+            at = pixel_centres(width, len(rows), self.device)
             at[..., 1] += top
             missed = rows - look_up(rendered, at * fine)
             if ignored is not None:
@@ -238,10 +240,11 @@ class SourceViews:
     def _make_view(self, frame: int) -> PlateView:
         width, height = self.size
         frozen, image = self._render(frame, width, height)
+        viewmat, K = self.camera(frame, width, height)
         matte = self.moving(frame)
-        moving = image.motion if matte is None else resized(matte, width, height)
+        moving = image.motion if matte is None else resized(matte.to(self.device), width, height)
         # The working frame is large enough, and faster to read than 4K footage.
-        plate = read_image(self.scene.image_path(self.index[frame]), width, height, self.scene.display)
+        plate = read_image(self.scene.image_path(self.index[frame]), width, height, self.scene.display).to(self.device)
         ignored = self._ignored(frame)
         if ignored is not None:  # ignored pixels must not count as missed
             plate = torch.lerp(plate, image.color, ignored)
@@ -251,11 +254,12 @@ class SourceViews:
         difference = blurred(dilate(difference, region), 0.5 * region)
         explained = torch.exp(-(difference / self.config.unexplained).square()).half().float()
         return PlateView(
-            *self.camera(frame, width, height),
+            viewmat.to(self.device),
+            K.to(self.device),
             torch.stack([image.depth, dilate(moving, round(self.config.margin * self.unit)), explained], dim=-1),
             plate.half(),
             missed.half(),
-            frozen.state["means"].cpu()[self.rows],
+            frozen.state["means"][self.rows],
             image.color.half() if self.size == (self.plates.width, self.plates.height) else None,
             ignored,
         )
@@ -266,7 +270,8 @@ class SourceViews:
         if mask is None or not bool((mask > 0).any()):
             return None
         margin = max(1, round(self.config.margin * self.unit))
-        return blurred(dilate(resized(mask, *self.size), 2 * margin), 0.5 * margin).clamp(0.0, 1.0)[..., None]
+        mask = dilate(resized(mask.to(self.device), *self.size), 2 * margin)
+        return blurred(mask, 0.5 * margin).clamp(0.0, 1.0)[..., None]
 
 
 def motion_mattes(shot: Shot) -> MovingOf:

@@ -50,16 +50,13 @@ class TargetView:
     """[h, w] in 0..1: `motion`, and on the clip's own poses also the pixels where the frame's own plate is rejected."""
     out_of_view: Tensor
     """[h, w] in 0..1: pixels of moving surfaces that no plate near t* shows, so their state at t* is unknown."""
+    centre: Tensor
+    """[3] camera centre, scene units; on the CPU, as the cameras of the clip."""
 
     def settings(self, width: int, height: int) -> RasterSettings:
         """Settings to render the picture, overscan included, at another size."""
         rows, columns = self.image.alpha.shape
         return RasterSettings(overscan=(self.beyond[0] * width / columns, self.beyond[1] * height / rows))
-
-    @property
-    def centre(self) -> Tensor:
-        """[3] camera centre, scene units."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
 def target_view(
@@ -82,18 +79,20 @@ def target_view(
     K, beyond = with_overscan(output.K, image, width, height)
     per_pixel = min(1.0, source_views.config.width / width)
     w, h = max(8, round(columns * per_pixel)), max(8, round(rows * per_pixel))
-    small = pixel_centres(w, h)
+    device = image.depth.device
+    viewmat, small = output.viewmat.to(device), pixel_centres(w, h, device)
     # Pixel at each centre, in integers: a centre on the border of two pixels always belongs to the second.
-    across, down = ((2 * torch.arange(n, device="cpu") + 1) * of // (2 * n) for n, of in ((w, columns), (h, rows)))
+    across, down = ((2 * torch.arange(n, device=device) + 1) * of // (2 * n) for n, of in ((w, columns), (h, rows)))
     depth = image.depth[down[:, None], across]
-    points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
+    points = unproject(small, depth, viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0].to(device))
     t = min(source_views.frames, key=lambda frame: abs(frame - output.t_star))
     motion = resized(image.motion, w, h)
     is_clip_view = _is_clip_view(source_views, output, width, height)
     zeros = torch.zeros_like(motion)
     return TargetView(
-        output.viewmat, K, image, source_views.scene.time_of_frame(output.exposed_like), is_clip_view, t, frozen,
+        viewmat, K.to(device), image, source_views.scene.time_of_frame(output.exposed_like), is_clip_view, t, frozen,
         points, depth, motion, w / columns, beyond, zeros, motion, zeros,
+        -output.viewmat[:3, :3].T @ output.viewmat[:3, 3],
     )  # fmt: skip
 
 
@@ -127,18 +126,17 @@ def displacements(
     w, h = size or target.depth.shape[::-1]
     rows, state = source_views.rows, target.frozen.state
     if not len(rows):
-        return [torch.zeros(h, w, 3, device="cpu") for _ in chosen]
+        return [target.points.new_zeros(h, w, 3) for _ in chosen]
     extra = torch.zeros(len(state["means"]), 3 * len(chosen), device=state["means"].device)
-    now = state["means"][rows].cpu()
+    now = state["means"][rows]
     for n, frame in enumerate(chosen):
-        extra[rows, 3 * n : 3 * n + 3] = (source_views.view(frame).offsets - now).to(extra.device)
+        extra[rows, 3 * n : 3 * n + 3] = source_views.view(frame).offsets - now
     rows_full, columns = target.image.alpha.shape
     K = resize_intrinsics(target.K[None], columns, rows_full, w, h)[0]
     out = render(
-        state, 0, target.viewmat.to(extra.device), K.to(extra.device), w, h, colors=extra, with_contributions=False,
-        settings=target.settings(w, h),
+        state, 0, target.viewmat, K, w, h, colors=extra, with_contributions=False, settings=target.settings(w, h),
     )  # fmt: skip
-    flow = (out.colors[0, ..., 3:] / out.alphas[0].clamp_min(1e-3)[..., None]).cpu()
+    flow = out.colors[0, ..., 3:] / out.alphas[0].clamp_min(1e-3)[..., None]
     return [flow[..., 3 * n : 3 * n + 3] for n in range(len(chosen))]
 
 

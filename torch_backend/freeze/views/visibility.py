@@ -1,4 +1,4 @@
-"""Visibility of world points in a plate, as a C++ kernel compiled by Warp.
+"""Visibility of world points in a plate: on the processor a C++ kernel compiled by Warp, on a card torch's operators.
 
 The kernel fuses `project`, `inside` and `look_up` of `reproject.py` with a comparison of depths. A frozen frame needs
 it for about 30 plates. As 40 tensor operators it took a third of the time per frame.
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ...kernel_text import kernel_text
 from ...native import INTEGER, POINTER, Snippet
+from .reproject import inside, look_up, project
 
 _POINTS = 2048
 """Number of points per unit of work."""
@@ -66,16 +67,18 @@ def visible_pixels(
         soft: width in pixels of the ramp at the border over which visibility falls to 0.
 
     Raises:
-        ValueError: a tensor is not float32 or not on the CPU.
+        ValueError: a tensor is not float32, or on another device than `surface`.
     """
+    tensors = [value for value in (points, viewmat, K, surface, ignored) if value is not None]
+    if any(value.dtype != torch.float32 or value.device != surface.device for value in tensors):
+        raise ValueError("points, cameras, surface and ignored must be float32 and on one device")
+    if surface.device.type != "cpu":
+        return visible_by_operators(points, viewmat, K, surface, ignored, tolerance, soft)
     shape, height, width = points.shape[:-1], *surface.shape[:2]
     points, surface = points.contiguous(), surface.contiguous()
     ignored = None if ignored is None else ignored.contiguous()
-    camera = torch.cat([viewmat[:3].flatten(), torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])]).float().contiguous()
+    camera = torch.cat([viewmat[:3].flatten(), torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])]).contiguous()
     settings = torch.tensor([tolerance, soft], device="cpu")
-    tensors = [value for value in (points, surface, ignored, camera) if value is not None]
-    if any(value.dtype != torch.float32 or value.device.type != "cpu" for value in tensors):
-        raise ValueError("points, cameras, surface and ignored must be float32 and on the CPU")
     pixels = torch.empty(*shape, 2, device="cpu")
     depth, visible, moving, explained = (torch.empty(shape, device="cpu") for _ in range(4))
     count = depth.numel()
@@ -85,4 +88,18 @@ def visible_pixels(
         pixels=pixels.data_ptr(), depth=depth.data_ptr(), visible=visible.data_ptr(), moving=moving.data_ptr(),
         explained=explained.data_ptr(), count=count, width=width, height=height,
     )  # fmt: skip
+    return Visibility(pixels, depth, visible, moving, explained)
+
+
+def visible_by_operators(
+    points: Tensor, viewmat: Tensor, K: Tensor, surface: Tensor, ignored: Tensor | None, tolerance: float, soft: float
+) -> Visibility:
+    """`visible_pixels` by torch's operators, on any device; the kernel's results up to rounding."""
+    pixels, depth = project(points, viewmat, K)
+    near, moving, explained = look_up(surface, pixels).unbind(-1)
+    free = inside(pixels, surface.shape[1], surface.shape[0], soft)
+    if ignored is not None:
+        free = free * (1.0 - look_up(ignored, pixels)[..., 0])
+    off = (depth - near) / (tolerance * depth.clamp_min(1e-6))
+    visible = (torch.exp(-off.square()) * free).nan_to_num(0.0)  # non-finite points are invisible
     return Visibility(pixels, depth, visible, moving, explained)

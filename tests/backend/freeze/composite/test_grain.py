@@ -6,7 +6,7 @@ import pytest
 from torch_backend.footage.color import linear_to_srgb, srgb_to_linear
 from torch_backend.footage.display import PLAIN, ROLLED
 from torch_backend.footage.images import write_png
-from torch_backend.freeze.composite.grain import BINS, Brush, Grain, draw, measure, measure_plate
+from torch_backend.freeze.composite.grain import BINS, Brush, Grain, _noise, draw, measure, measure_plate
 
 AGREEMENT = np.array([[1.0, 0.6, 0.2], [0.6, 1.0, 0.3], [0.2, 0.3, 1.0]], np.float32)
 HEIGHT, WIDTH = 192, 320
@@ -127,6 +127,39 @@ def test_downscaled_frame_has_downscaled_plate_grain():
 def test_grain_drawn_some_rows_at_a_time_is_the_same(size):
     width, height = size
     picture = np.random.default_rng(0).uniform(size=(height, width, 4)).astype(np.float32)
+    ones = np.ones((height, width), np.float32)
     brush = Brush(GRAIN, 5, (height, width), (WIDTH, HEIGHT))
-    parts = [brush.rows(slice(top, top + 50), picture[top : top + 50]) for top in range(0, height, 50)]
+    parts = [
+        brush.rows(of, picture[of, :, :3], picture[of, :, 3], ones[of])
+        for of in (slice(top, top + 50) for top in range(0, height, 50))
+    ]
     np.testing.assert_array_equal(np.concatenate(parts), draw(GRAIN, 5, picture, (WIDTH, HEIGHT)))
+
+
+def light(encoded: np.ndarray) -> np.ndarray:
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+@pytest.mark.parametrize("is_light", [False, True])
+def test_grain_is_noise_times_the_deviation_of_each_brightness(is_light):
+    """Against its definition in float64, in a picture of half again the plate's size."""
+    rng, (width, height), size = np.random.default_rng(2), (63, 36), (42, 24)
+    noise = _noise(GRAIN, 9, size).astype(np.float64)
+    for axis, length in ((0, height), (1, width)):
+        before = noise.shape[axis]
+        at = np.clip((np.arange(length) + 0.5) * before / length - 0.5, 0.0, before - 1.0)
+        low = np.minimum(at.astype(int), before - 2)
+        part = (at - low).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
+        noise = noise.take(low, axis) * (1.0 - part) + noise.take(low + 1, axis) * part
+    shown, alpha, share = rng.uniform(0.0, 1.2, (height, width, 3)), *rng.uniform(0.0, 1.0, (2, height, width))
+    share[:, 10:50] = 0.0
+    premultiplied = shown * alpha[..., None]
+    bins = (np.arange(BINS) + 0.5) / BINS
+    straight = shown.clip(0.0, 1.0)
+    deviation = np.stack([np.interp(straight[..., c], bins, GRAIN.deviation[c]) for c in range(3)], -1)
+    want = light((straight + deviation * noise).clip(0.0, 1.0)) - light(straight)
+    found = Brush(GRAIN, 9, (height, width), size).rows(
+        slice(0, height), light(premultiplied) if is_light else premultiplied, alpha, share, is_light
+    )
+    np.testing.assert_allclose(found, want * (alpha * share)[..., None], atol=1e-6)
+    assert not np.signbit(found[share == 0.0]).any(), "negative zeros do not compress"

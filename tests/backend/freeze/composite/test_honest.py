@@ -32,6 +32,12 @@ class Stays(Deformation):
         return Deltas(torch.tensor([board_at(T_STAR), 0.0, 0.0]).expand(len(means), 3))
 
 
+@pytest.fixture
+def board_stays(world, monkeypatch):
+    """The model keeps the board at its place at T_STAR."""
+    monkeypatch.setattr(world.run, "model", replace(world.run.model, field=Stays()))
+
+
 def erode(mask, by):
     return ndimage.binary_erosion(mask, np.ones((2 * by + 1,) * 2))
 
@@ -81,16 +87,12 @@ def test_object_that_moved_since_t_star_is_not_shown(world):
     assert (composited.matte.numpy()[wall] == 1.0).all(), "and nothing else is let go of"
 
 
+@pytest.mark.usefixtures("board_stays")
 def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
     """As above, but the model keeps the board at its place at t*: only the difference between both plates shows the
     change."""
-    before = world.run.model
-    world.run.model = replace(before, field=Stays())
     still = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
-    try:
-        composited, without_evidence = make(world, still), make(world, still, **BLIND)
-    finally:
-        world.run.model = before
+    composited, without_evidence = make(world, still), make(world, still, **BLIND)
     assert stale_board_share(world, composited) < 0.1
     assert stale_board_share(world, without_evidence) > 0.9, "else there is nothing to mend"
 
@@ -128,16 +130,12 @@ def test_plate_is_kept_where_the_model_contradicts_plate_t_star(world):
             colors.copy_(before)
 
 
+@pytest.mark.usefixtures("board_stays")
 def test_plates_that_fill_show_nothing_of_it_either(world):
     """Flow found the board only in the frame's own plate, and the model keeps the board at its place at t*."""
-    before = world.run.model
-    world.run.model = replace(before, field=Stays())
-    try:
-        mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14) if frame not in (FRAME, T_STAR)}
-        composited = make(world, mattes, None)
-        believed = make(world, mattes, VisibilityConfig(unexplained=1e6), state=StateConfig(noise=1e6))
-    finally:
-        world.run.model = before
+    mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14) if frame not in (FRAME, T_STAR)}
+    composited = make(world, mattes, None)
+    believed = make(world, mattes, VisibilityConfig(unexplained=1e6), state=StateConfig(noise=1e6))
     assert stale_board_share(world, composited) < 0.01
     assert stale_board_share(world, believed) > 0.1, "else there is nothing to mend"
 

@@ -135,6 +135,5 @@ def test_a_run_without_maps_has_no_measurement(trained):
     from torch_backend.scene import load_scene
     from torch_backend.train import load_run
 
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    run, scene = load_run(trained.shot, "main"), load_scene(trained.shot)
     assert MeasuredDepths(run, scene).at(104, freeze_at(run.model, 0.5, 1.0)) is None

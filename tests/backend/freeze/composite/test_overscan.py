@@ -21,24 +21,21 @@ RANGE = {"t_star": 105, "first": 104, "last": 105, "develop": "off"}
 @pytest.fixture(scope="module")
 def lens(trained):
     """The tiny world with a barrel lens in its solve."""
-    world, _ = trained
     record = {"version": 1, "camera_model": "SIMPLE_RADIAL", "distortion": [-0.2], "focal_px": 61.9}
-    write_json(world.shot.solve / "solve.json", record)
-    yield load_lens(world.shot)
-    (world.shot.solve / "solve.json").unlink()
+    write_json(trained.shot.solve / "solve.json", record)
+    yield load_lens(trained.shot)
+    (trained.shot.solve / "solve.json").unlink()
 
 
 @pytest.fixture(scope="module")
 def plain(trained, lens, quiet):
-    world, _ = trained
-    freeze_shot(world.shot, FreezeParams(take="plain", **RANGE), quiet())
-    return world.shot.take("plain")
+    freeze_shot(trained.shot, FreezeParams(take="plain", **RANGE), quiet())
+    return trained.shot.take("plain")
 
 
 def test_the_frame_inside_is_the_take_without_overscan(trained, lens, plain, quiet):
-    world, _ = trained
-    facts = freeze_shot(world.shot, FreezeParams(take="over", overscan=12.5, **RANGE), quiet())
-    folder = world.shot.take("over")
+    facts = freeze_shot(trained.shot, FreezeParams(take="over", overscan=12.5, **RANGE), quiet())
+    folder = trained.shot.take("over")
     assert (facts["width"], facts["height"], facts["margin"]) == (64, 48, [8, 6])
     for n in (104, 105):
         whole, frame = read_frozen_exr(folder / f"{n:06d}.exr"), read_frozen_exr(plain / f"{n:06d}.exr")
@@ -69,11 +66,10 @@ def test_the_frame_inside_is_the_take_without_overscan(trained, lens, plain, qui
 
 
 def test_what_the_lens_needs_is_rendered_and_its_map_is_with_the_take(trained, lens, quiet):
-    world, _ = trained
-    facts = freeze_shot(world.shot, FreezeParams(take="lens", overscan=-1.0, **RANGE), quiet())
+    facts = freeze_shot(trained.shot, FreezeParams(take="lens", overscan=-1.0, **RANGE), quiet())
     across, down = needed_margin(lens, 64, 48)
     assert facts["margin"] == [across, down] and across > 2 and facts["overscan"] == -1.0
-    frame = read_frozen_exr(world.shot.take("lens") / "000105.exr")
+    frame = read_frozen_exr(trained.shot.take("lens") / "000105.exr")
     assert frame.rgba.shape == (48 + 2 * down, 64 + 2 * across, 4)
     found = oiio.ImageBuf(facts["redistort"]).get_pixels(oiio.FLOAT)
     np.testing.assert_array_equal(found, redistort_map(lens, 64, 48, (across / 64, down / 48)))
@@ -81,11 +77,10 @@ def test_what_the_lens_needs_is_rendered_and_its_map_is_with_the_take(trained, l
 
 
 def test_another_overscan_makes_the_frames_stale_and_none_leaves_no_map(trained, lens, quiet):
-    world, _ = trained
-    folder = world.shot.take("change")
+    folder = trained.shot.take("change")
     sizes = []
     for overscan in (0.0, 12.5, 12.5, 0.0):
-        freeze_shot(world.shot, FreezeParams(take="change", overscan=overscan, only_missing=True, **RANGE), quiet())
+        freeze_shot(trained.shot, FreezeParams(take="change", overscan=overscan, only_missing=True, **RANGE), quiet())
         sizes.append(read_frozen_exr(folder / "000104.exr").rgba.shape[1])
         assert (folder / "stmap" / "redistort.exr").is_file() == bool(overscan)
     assert sizes == [64, 80, 80, 64]
@@ -93,28 +88,26 @@ def test_another_overscan_makes_the_frames_stale_and_none_leaves_no_map(trained,
 
 
 def test_custom_camera_has_percent_overscan_and_no_map(trained, lens, quiet, tmp_path):
-    world, _ = trained
-    pose = world.viewmats[7].flatten().tolist()
+    pose = trained.viewmats[7].flatten().tolist()
     path = CameraPath(64, 48, [CameraFrame(1, pose, [90.0, 90.0, 32.0, 24.0], "blender")])
     write_json(tmp_path / "path.json", path.to_json())
     params = {"take": "own", "t_star": 108, "camera_path": str(tmp_path / "path.json"), "width": 64}
-    facts = freeze_shot(world.shot, FreezeParams(overscan=25.0, **params), quiet())
+    facts = freeze_shot(trained.shot, FreezeParams(overscan=25.0, **params), quiet())
     assert facts["margin"] == [16, 12] and facts["redistort"] == ""
     with pytest.raises(JobError, match="only known for the clip's own camera"):
-        freeze_shot(world.shot, FreezeParams(overscan=-1.0, **params), quiet())
+        freeze_shot(trained.shot, FreezeParams(overscan=-1.0, **params), quiet())
 
 
 def test_a_lens_without_a_way_back_is_said_and_the_percentage_still_rendered(trained, lens, quiet):
-    world, _ = trained
-    record = world.shot.solve / "solve.json"
+    record = trained.shot.solve / "solve.json"
     before = json.loads(record.read_text())
     write_json(record, {**before, "distortion": [-2.0]})
     try:
         report = quiet()
-        facts = freeze_shot(world.shot, FreezeParams(take="fold", overscan=12.5, **RANGE), report)
+        facts = freeze_shot(trained.shot, FreezeParams(take="fold", overscan=12.5, **RANGE), report)
         assert facts["margin"] == [8, 6] and facts["redistort"] == ""
         assert any(e[0] == "warning" and "folds over" in e[1] for e in report.events)
         with pytest.raises(JobError, match="folds over"):
-            freeze_shot(world.shot, FreezeParams(take="fold", overscan=-1.0, **RANGE), quiet())
+            freeze_shot(trained.shot, FreezeParams(take="fold", overscan=-1.0, **RANGE), quiet())
     finally:
         write_json(record, before)

@@ -9,7 +9,7 @@ import torch
 from benchmarks.fit_state import NAMES, Case, fit, judged
 from tests.backend.freeze.composite.test_compositor import H, W, build, dilate
 from torch_backend.freeze.composite.compositor import Compositor
-from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go, log_odds
+from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, log_odds, rejection
 from torch_backend.freeze.frozen import freeze_at, render_frozen
 from torch_backend.freeze.views.ignored import ignore_mattes
 from torch_backend.freeze.views.source_views import SourceViews
@@ -60,14 +60,14 @@ def test_odds_are_a_weighted_sum_and_a_still_world_keeps_its_plate_to_the_bit(fo
     weights = config.weights
     want = weights.bias + sum(getattr(weights, name) * with_instant[name].double() for name in with_instant)
     torch.testing.assert_close(log_odds(with_instant, config, 1.0).double(), want, rtol=1e-5, atol=1e-5)
-    share = let_go(log_odds(with_instant, StateConfig(), W / 640), StateConfig()).numpy()
+    share = rejection(log_odds(with_instant, StateConfig(), W / 640), StateConfig()).numpy()
     assert (share[np.logical_not(dilate(board_now | board_at_t_star, 40))] == 0.0).all()
     assert (share[board_now & np.logical_not(dilate(board_at_t_star, 8))] > 0.99).mean() > 0.95
 
 
 def test_log_odds_become_a_soft_border():
     odds = torch.tensor([-9.0, -2.0, -1.0, 0.0, 1.0, 2.0, 9.0])
-    share = let_go(odds, StateConfig(softness=2.0))
+    share = rejection(odds, StateConfig(softness=2.0))
     torch.testing.assert_close(share, torch.tensor([0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0]))
 
 

@@ -47,18 +47,27 @@ T_STAR = 105
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, quiet):
+def world(tmp_path_factory, quiet):
     """As in other tests, but with few steps: developing improves runs that are not yet as sharp as their pictures."""
     world = build_world(tmp_path_factory.mktemp("young"))
     paint_motion(world)
-    summary = train_shot(world.shot, TrainParams(iterations=250, holdout=8, max_gaussians=1500), quiet())
-    return world, summary
+    train_shot(world.shot, TrainParams(iterations=250, holdout=8, max_gaussians=1500), quiet())
+    return world
+
+
+@pytest.fixture
+def run(world):
+    return load_run(world.shot, "main")
+
+
+@pytest.fixture
+def scene(world):
+    return load_scene(world.shot)
 
 
 @pytest.fixture(scope="module")
-def developed_world(trained, quiet):
+def developed_world(world, quiet):
     """(run, scene, instant of the field, developed instant, which is stored)."""
-    world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     report = quiet()
     instants = Instants(world.shot, run, scene, "nearest", [T_STAR])
@@ -123,7 +132,7 @@ def test_each_row_knows_what_repaired_it(developed_world):
     assert not bool(untouched.origin.any()) and untouched.state is frozen.state
 
 
-def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, developed_world):
+def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(developed_world):
     run, scene, frozen, _ = developed_world
     travel = SceneFlow(run, scene, frozen, T_STAR)
     assert len(travel.rows) > 10
@@ -154,10 +163,8 @@ def halves(run, frozen):
     return rows[x < x.median()], rows[x >= x.median()]
 
 
-def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
+def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(world, run, scene):
     """The field lacks half of the moving Gaussians, as if it had never learnt them."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen = field(run, scene)
     lost, rest = halves(run, frozen)
     opacity = frozen.state["opacity_logits"].index_fill(0, lost, -20.0)
@@ -178,10 +185,8 @@ def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
         assert bool((torch.sigmoid(moved["opacity_logits"][added]) < 1e-6).all())
 
 
-def test_floaters_are_hidden_and_static_gaussians_kept(trained):
+def test_floaters_are_hidden_and_static_gaussians_kept(world, run, scene):
     """A part of the moving Gaussians has a colour that plate t* does not show there."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen = field(run, scene)
     wrong, _ = halves(run, frozen)
     sh0 = frozen.state["sh0"].index_copy(0, wrong, -frozen.state["sh0"][wrong] + 1.0)
@@ -193,10 +198,8 @@ def test_floaters_are_hidden_and_static_gaussians_kept(trained):
     assert int(changed[wrong].sum()) > 4 * int(changed[correct].sum())
 
 
-def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
+def test_an_instant_with_added_gaussians_is_kept_whole(world, run, scene, monkeypatch):
     """The instant is written, read again, and refused if a row is missing."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, t_star = field(run, scene, 109), 109
     extra = {name: value[:5] for name, value in frozen.state.items()}
 
@@ -233,9 +236,7 @@ def in_tatters(run, frozen):
     return torn, wall
 
 
-def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(trained):
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(world, run, scene):
     frozen, patch = field(run, scene), run.model.open_rows()
     torn, wall = in_tatters(run, frozen)
     mended = apply_static_baseline(run, scene, torn, T_STAR, motion_mattes(world.shot))
@@ -248,10 +249,8 @@ def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(tra
     assert ours[0] > was_moving - 0.1 and ours[0] > static[0] + 1.0 and bool(stays.any())
 
 
-def test_nearer_plates_are_used_even_where_the_object_moves(trained):
+def test_nearer_plates_are_used_even_where_the_object_moves(run, scene):
     """The wall is wrongly opened at t*, and mattes call everything moving, so no static pixel contradicts it."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     torn, wall = in_tatters(run, field(run, scene))
     closed = []
     for nearer in (0.0, 1e9):  # no plate counts as nearer, then every plate does
@@ -261,10 +260,8 @@ def test_nearer_plates_are_used_even_where_the_object_moves(trained):
     assert closed[0] == 0.0 and closed[1] > 0.8
 
 
-def test_far_moving_gaussians_stay_open_without_a_matte(trained):
+def test_far_moving_gaussians_stay_open_without_a_matte(run, scene):
     """`doubted` closes Gaussians that sway outside of moving mattes, but never those that moved far."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, blind = field(run, scene), lambda frame: torch.zeros(scene.height, scene.width)
     left = {}
     for sways in (0.0, 1e9):  # all of them moved far, then none
@@ -277,10 +274,8 @@ def test_far_moving_gaussians_stay_open_without_a_matte(trained):
     assert left[1e9, 1.0] > 1.2 * left[1e9, 1e9]
 
 
-def test_undersampled_gaussians_are_found(trained):
+def test_undersampled_gaussians_are_found(run, scene):
     """A Gaussian is undersampled if some frame that saw it was less than half as far away."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     centres = -(scene.viewmats[:, :3, :3].mT @ scene.viewmats[:, :3, 3:])[..., 0]
     first, last = (scene.frames.index(run.train_frames[n]) for n in (0, -1))
     support = run.model.gaussians.support
@@ -294,9 +289,7 @@ def test_undersampled_gaussians_are_found(trained):
     assert undersampled(run, scene, means, scene.frames[first], 20.0).tolist() == [False] * 4
 
 
-def test_undersampled_moving_gaussians_are_not_trained(trained):
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+def test_undersampled_moving_gaussians_are_not_trained(world, run, scene):
     frozen, rows, mattes = field(run, scene), run.model.open_rows(), motion_mattes(world.shot)
     config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005)
     result = develop(run, scene, frozen, T_STAR, mattes, config)
@@ -309,11 +302,9 @@ def test_undersampled_moving_gaussians_are_not_trained(trained):
     assert float(changed[frozen.motion < 0.5].float().mean()) > 0.9, "others show it as it is, too"
 
 
-def test_undersampled_closed_gaussians_are_not_trained(trained):
+def test_undersampled_closed_gaussians_are_not_trained(run, scene):
     """The Gaussians are closed, and one frame's matte calls them moving; other frames must not teach those seen from
     afar."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frames = [frame for frame in run.train_frames if frame != T_STAR]
     frozen, once = field(run, scene), spread(frames[1:-1], len(frames) // 4)[-1]  # a probe frame
 
@@ -348,8 +339,7 @@ def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(tmp_path, quiet)
     assert float((blind.motion[rows] > 0.5).float().mean()) > 0.35 and now > was - 2.0
 
 
-def test_a_developed_instant_is_nearer_to_the_truth(trained, developed_world):
-    world, _ = trained
+def test_a_developed_instant_is_nearer_to_the_truth(world, developed_world):
     run, scene, frozen, now = developed_world
     (moving, still), (was_moving, was_still) = (scores(world, run, scene, f) for f in (now, frozen))
     assert (
@@ -357,10 +347,8 @@ def test_a_developed_instant_is_nearer_to_the_truth(trained, developed_world):
     )  # three seeds of the training gave at least 3.3 and 0.5
 
 
-def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):
+def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(world, run, scene):
     """The field has a pale and grey patch; plate t* still shows the original patch."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     rows = run.model.open_rows()
     run.model.gaussians.params["sh0"].data[rows] = 0.0
     run.model.gaussians.params["opacity_logits"].data[rows] -= 2.0
@@ -370,9 +358,8 @@ def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):
     assert moving > was_moving + 6.0 and still > was_still - 0.5
 
 
-def test_object_missing_in_neighbour_plates_is_not_erased(trained, developed_world):
+def test_object_missing_in_neighbour_plates_is_not_erased(world, developed_world):
     """In plates far from t* the patch is elsewhere, and its place at t* shows the wall."""
-    world, _ = trained
     run, scene, frozen, _ = developed_world
     config = DevelopConfig(steps=200, gain=-99.0)  # accepts any change on held-out frames
     now = develop(run, scene, frozen, T_STAR, motion_mattes(world.shot), config)
@@ -380,8 +367,7 @@ def test_object_missing_in_neighbour_plates_is_not_erased(trained, developed_wor
     assert after > before - 1.0 and not torch.equal(now.state["sh0"], frozen.state["sh0"])
 
 
-def test_a_kept_instant_is_read_back_to_the_bit(trained, developed_world):
-    world, _ = trained
+def test_a_kept_instant_is_read_back_to_the_bit(world, developed_world):
     run, _, frozen, now = developed_world
     again = load_developed(world.shot, run, T_STAR, frozen)
     assert again is not None and same(again, now)
@@ -390,8 +376,7 @@ def test_a_kept_instant_is_read_back_to_the_bit(trained, developed_world):
     assert load_developed(world.shot, run, 106, frozen) is None
 
 
-def test_only_movers_are_developed_if_static_pixels_gain_little(trained, developed_world):
-    world, _ = trained
+def test_only_movers_are_developed_if_static_pixels_gain_little(world, developed_world):
     run, scene, frozen, _ = developed_world
     config, path = DevelopConfig(steps=150, gain=99.0), developed_path(run, 106)
     frozen = field(run, scene, 106)
@@ -434,9 +419,8 @@ def test_evidence_of_plate_t_star_is_weighted_by_neighbour_plates(shot_copy, mon
 
 
 @pytest.fixture
-def shot_copy(trained, tmp_path):
+def shot_copy(world, tmp_path):
     """(shot, run, scene, instant of the field) of a copy of the shot that the test may change."""
-    world, _ = trained
     root = shutil.copytree(world.shot.root, tmp_path / "tiny.splannequin", ignore=shutil.ignore_patterns("takes"))
     shutil.rmtree(root / "runs" / "main" / "developed", ignore_errors=True)
     shot = type(world.shot).open(root)
@@ -499,14 +483,13 @@ def test_cancelling_leaves_nothing(shot_copy, quiet):
     assert len(report.events) == 1 + math.ceil(0.01 * config_for(run).steps), "it stops at once"
 
 
-def test_take_is_finished_even_if_the_instant_cannot_be_stored(shot_copy, trained, developed_world, quiet):
+def test_take_is_finished_even_if_the_instant_cannot_be_stored(world, shot_copy, developed_world, quiet):
     shot, run, _, _ = shot_copy
-    world, _ = trained
     (run.folder / "developed").write_text("in the way")
     report = quiet()
     ask = dict(t_star=T_STAR, first=105, last=106, detail="off", grain=False)
     assert freeze_shot(shot, FreezeParams(**ask), report)["developed"] == [T_STAR]
-    warnings = [event[1] for event in report.events if event[0] == "warning"]
+    warnings = report.warnings
     assert (
         len(warnings) == 1
         and warnings[0].startswith("The developed instant was not saved:")
@@ -518,8 +501,7 @@ def test_take_is_finished_even_if_the_instant_cannot_be_stored(shot_copy, traine
     np.testing.assert_array_equal(*pictures)
 
 
-def test_switching_develop_rerenders_frames(trained, developed_world, quiet):
-    world, _ = trained
+def test_switching_develop_rerenders_frames(world, developed_world, quiet):
     keys, facts, frame = [], [], world.shot.take("switched") / "000105.exr"
     for wanted in ("off", "off", "on", "on", "off"):
         ask = FreezeParams(take="switched", t_star=T_STAR, first=105, last=105, only_missing=True, develop=wanted)
@@ -529,8 +511,7 @@ def test_switching_develop_rerenders_frames(trained, developed_world, quiet):
     assert keys[0] == keys[1] != keys[2] == keys[3] and keys[4][0] == keys[0][0] != keys[2][0]
 
 
-def test_keyed_instants_of_trained_frames_are_developed_up_to_a_limit(trained, developed_world):
-    world, _ = trained
+def test_keyed_instants_of_trained_frames_are_developed_up_to_a_limit(world, developed_world):
     run, scene = developed_world[:2]
     trained_on, held_out_frames = run.train_frames, sorted({*scene.frames} - {*run.train_frames})
 
@@ -544,8 +525,7 @@ def test_keyed_instants_of_trained_frames_are_developed_up_to_a_limit(trained, d
     assert len(keys) == 4
 
 
-def test_scrubbing_shows_an_instant_as_soon_as_it_has_been_developed(trained, developed_world, tmp_path):
-    world, _ = trained
+def test_scrubbing_shows_an_instant_as_soon_as_it_has_been_developed(world, developed_world, tmp_path):
     run, scene, frozen, now = developed_world
     session, path, i = LiveSession(world.shot, "main", "cpu"), developed_path(run, T_STAR), T_STAR - 101
     view = LiveView(1, 1, world.viewmats[i].flatten().tolist(), [60.0, 60.0, 32.0, 24.0], 64, 48, T_STAR, T_STAR)

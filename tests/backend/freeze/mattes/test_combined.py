@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.backend.conftest import outline
 from torch_backend.contract import CombineParams, FreezeParams, JobError, MatteParams, SurfaceParams, TakeFolder
 from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png
@@ -16,7 +17,6 @@ from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.mattes.combined import Source, combine, combined, dilated, with_motion
 from torch_backend.freeze.mattes.job import make_mattes
 from torch_backend.freeze.surface.job import make_surface
-from torch_backend.raster import rasterize
 
 FIRST, LAST = 104, 111
 INSTANTS = {"early": 105, "late": 113}
@@ -25,10 +25,7 @@ INSTANTS = {"early": 105, "late": 113}
 
 def covered(world, pose, t):
     """[H, W] bool: pixels that the patch covers from a pose at the time of frame `t`."""
-    state = {name: value[world.moving] for name, value in world.at((t - 101) / 15).items()}
-    n = pose - 101
-    out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
-    return out.alphas[0].numpy() > 0.5
+    return world.patch(pose - 101, (t - 101) / 15) > 0.5
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +35,7 @@ def world(trained_copy, quiet, tmp_path_factory):
     for name, t_star in INSTANTS.items():
         params = FreezeParams(take=name, t_star=t_star, first=FIRST, last=LAST, passes=True)
         freeze_shot(world.shot, params, quiet())
-        mask = covered(world, 107, t_star).astype(np.uint8)
-        outline, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        row = {"name": "patch", "frame": 107, "polygon": (max(outline, key=len)[:, 0] + 0.5).tolist()}
+        row = {"name": "patch", "frame": 107, "polygon": outline(covered(world, 107, t_star))}
         path = tmp_path_factory.mktemp("lassos") / "lassos.json"
         path.write_text(json.dumps({"mattes": [row]}), encoding="utf-8")
         make_mattes(world.shot, MatteParams(take=name, polygons=str(path)), quiet())

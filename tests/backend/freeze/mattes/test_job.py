@@ -2,31 +2,22 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
 
+from tests.backend.conftest import outline
 from torch_backend.contract import Cancelled, FreezeParams, JobError, MatteParams, TakeFolder
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.mattes.carry import in_order
 from torch_backend.freeze.mattes.files import read_matte
 from torch_backend.freeze.mattes.job import make_mattes, stored_lassos
-from torch_backend.raster import rasterize
 
 T_STAR, LASSO = 105, 108
 
 
 def truth(world, pose):
     """[H, W] bool: pixels that the patch covers from a pose at the frozen instant."""
-    state = {name: value[world.moving] for name, value in world.at((T_STAR - 101) / 15).items()}
-    n = pose - 101
-    out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
-    return out.alphas[0].numpy() > 0.5
-
-
-def outline(mask):
-    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return (max(found, key=len)[:, 0] + 0.5).tolist()
+    return world.patch(pose - 101, (T_STAR - 101) / 15) > 0.5
 
 
 @pytest.fixture

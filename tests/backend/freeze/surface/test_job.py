@@ -18,9 +18,8 @@ T_STAR = 105
 @pytest.fixture(scope="module")
 def take(trained, quiet):
     """(world, folder of a take)."""
-    world, _ = trained
-    freeze_shot(world.shot, FreezeParams(take="solid", t_star=T_STAR, first=102, last=116, detail="off"), quiet())
-    return world, TakeFolder(world.shot.take("solid"))
+    freeze_shot(trained.shot, FreezeParams(take="solid", t_star=T_STAR, first=102, last=116, detail="off"), quiet())
+    return trained, TakeFolder(trained.shot.take("solid"))
 
 
 def in_solve(folder):

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from tests.backend.footage.test_plates import solved
-from torch_backend.contract import PROBE, Reporter
+from tests.backend.pictures import write
+from tests.backend.quiet import Quiet
+from torch_backend.contract import PROBE
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png, write_png
@@ -20,10 +22,6 @@ from torch_backend.lens.plate_lens import load_plate_lenses
 from torch_backend.shot import Shot
 
 
-class Quiet(Reporter):
-    """Reporter that discards all messages."""
-
-
 def pictures(folder, count=9, size=(96, 128), suffix="png", **attributes):
     """Write pictures of a camera that pans over a smooth texture."""
     folder.mkdir()
@@ -32,15 +30,11 @@ def pictures(folder, count=9, size=(96, 128), suffix="png", **attributes):
     wide += np.random.default_rng(0).uniform(-0.02, 0.02, wide.shape)
     for n in range(count):
         picture = np.ascontiguousarray(wide[:, 4 * n : 4 * n + size[1]])
-        path = str(folder / f"a.{1001 + n}.{suffix}")
+        path = folder / f"a.{1001 + n}.{suffix}"
         if suffix == "png":
             write_png(path, np.rint(picture * 255).astype(np.uint8))
-            continue
-        spec = oiio.ImageSpec(size[1], size[0], 3, "half")
-        for key, value in attributes.items():
-            spec.attribute(key, value)
-        out = oiio.ImageOutput.create(path)
-        assert out.open(path, spec) and out.write_image(picture.astype(np.float32)) and out.close()
+        else:
+            write(path, picture.astype(np.float16), **attributes)
     return folder
 
 

@@ -179,12 +179,15 @@ def test_a_part_stops_when_its_take_is_opened_with_something_else(frozen_shot, q
     assert frames and facts["frames"] == 3
 
 
-@pytest.mark.parametrize("name", ["000103.exr", "warp/000103.exr", "preview/000103.png"])
-def test_truncated_frame_is_rendered_again(frozen_shot, quiet, name):
+@pytest.mark.parametrize(
+    ("name", "share"),
+    [("000103.exr", 0.75), ("000103.exr", 0.0), ("warp/000103.exr", 0.75), ("preview/000103.png", 0.75)],
+)
+def test_truncated_frame_is_rendered_again(frozen_shot, quiet, name, share):
     params = FreezeParams(take="cut", **{**ASK, "last": 103})
     freeze_shot(frozen_shot, params, quiet())
     file = frozen_shot.take("cut") / name
     data = file.read_bytes()
-    file.write_bytes(data[: len(data) * 3 // 4])
+    file.write_bytes(data[: int(len(data) * share)])
     freeze_shot(frozen_shot, params, quiet())
     assert file.read_bytes() == data

@@ -96,16 +96,15 @@ def test_at_the_ends_of_a_take_nothing_is_beyond():
 
 def test_a_takes_passes_lie_on_its_cameras(trained, tmp_path, quiet):
     """Each position projects to its pixel and depth; moved by its vector, it matches the next frame's position."""
-    world, _ = trained
     placement = Placement([0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0])
     write_json(tmp_path / "placement.json", placement.to_json())
     params = FreezeParams(
         take="passes", t_star=105, first=104, last=106, passes=True, placement=str(tmp_path / "placement.json")
     )
-    facts = freeze_shot(world.shot, params, quiet())
+    facts = freeze_shot(trained.shot, params, quiet())
     assert facts["passes"]
     back = Similarity.of(placement).inverse()
-    frames = {n: read_frozen_exr(world.shot.take("passes") / f"{n:06d}.exr") for n in (104, 105, 106)}
+    frames = {n: read_frozen_exr(trained.shot.take("passes") / f"{n:06d}.exr") for n in (104, 105, 106)}
     for n, frame in frames.items():
         assert frame.more["Vector"].shape == (*frame.depth.shape, 4)
         np.testing.assert_array_equal(frame.more["forward"], -frame.more["Vector"][..., 2:])

@@ -14,19 +14,17 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from tests.backend.conftest import film
 from torch_backend.contract import CameraPath, FreezeParams, TrainParams
-from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.color import InputSpace, linear_to_srgb
 from torch_backend.footage.display import ROLLED
-from torch_backend.footage.images import read_png, write_png
+from torch_backend.footage.images import read_png
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze import freeze_shot
-from torch_backend.freeze.composite.state import StateConfig, let_go
+from torch_backend.freeze.composite.state import StateConfig, rejection
 from torch_backend.freeze.composite.warp import apply_warp, read_warp
 from torch_backend.freeze.exr import read_frozen_exr, read_key
 from torch_backend.motion.mattes import PAINTED, STILL, write_matte
-from torch_backend.raster import rasterize
-from torch_backend.shot import Shot
 from torch_backend.train import train_shot
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -49,16 +47,16 @@ def files(folder):
 
 @pytest.fixture(scope="module")
 def take(trained, quiet):
-    world, _ = trained
-    facts = freeze_shot(world.shot, FreezeParams(take="whole", **RANGE), quiet())
-    return world.shot.take("whole"), facts
+    facts = freeze_shot(trained.shot, FreezeParams(take="whole", **RANGE), quiet())
+    return trained.shot.take("whole"), facts
 
 
 def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
     """With `--debug-terms`, the frames are rendered again without change, and the log-odds reproduce the matte."""
-    world, _ = trained
     before = files(take[0])
-    freeze_shot(world.shot, FreezeParams(take="whole", only_missing=True, debug_terms=str(tmp_path), **RANGE), quiet())
+    freeze_shot(
+        trained.shot, FreezeParams(take="whole", only_missing=True, debug_terms=str(tmp_path), **RANGE), quiet()
+    )
     assert files(take[0]) == before
     assert sorted(path.stem for path in tmp_path.iterdir()) == [f"{n:06d}" for n in range(103, 109)]
     config = StateConfig()
@@ -67,16 +65,15 @@ def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
         terms = dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), 2, 0), strict=True))
         assert {"plate_matte", "change", "unseen", "agreed.105", "origin.develop"} <= terms.keys()
         matte = read_warp(take[0] / "warp" / f"{n:06d}.exr").matte
-        kept = 1.0 - let_go(torch.from_numpy(terms["log_odds"]), config)
+        kept = 1.0 - rejection(torch.from_numpy(terms["log_odds"]), config)
         assert kept.shape == matte.shape and float(kept.min()) < 0.1 < float(kept.max())
         np.testing.assert_allclose(np.asarray(matte), kept, atol=0.01)
         assert 0.02 < terms["origin.develop"].mean() <= 1.0
 
 
 def test_a_frame_is_its_warp_over_the_plate(trained, take):
-    world, _ = trained
     folder, facts = take
-    plates = Plates(world.shot)
+    plates = Plates(trained.shot)
     assert facts["warp_dir"] == str(folder / "warp")
     for n in range(103, 109):
         frame, warp = read_frozen_exr(folder / f"{n:06d}.exr"), read_warp(folder / "warp" / f"{n:06d}.exr")
@@ -92,27 +89,25 @@ def test_a_frame_is_its_warp_over_the_plate(trained, take):
 
 
 def test_without_detail_only_splats_are_rendered(trained, take, quiet):
-    world, _ = trained
     folder, _ = take
     whole = files(folder)
-    facts = freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, detail="off"), quiet())
-    bare = world.shot.take("bare")
+    facts = freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, detail="off"), quiet())
+    bare = trained.shot.take("bare")
     assert not (bare / "warp").exists() and "detail" not in facts and "warp_dir" not in facts
     for n in (103, 108):
         plain, detailed = read_frozen_exr(bare / f"{n:06d}.exr"), read_frozen_exr(folder / f"{n:06d}.exr")
         assert plain.detail is None
         splat = np.asarray(detailed.detail.splat)[..., :3]
         np.testing.assert_allclose(splat, plain.rgba[..., :3], rtol=4e-3, atol=1e-4)
-    freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, only_missing=True), quiet())
+    freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, only_missing=True), quiet())
     assert files(bare) == whole, "asked for plates, none of the old frames is right"
-    freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, only_missing=True, detail="off"), quiet())
+    freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, only_missing=True, detail="off"), quiet())
     assert not list((bare / "warp").glob("*.exr")), "warps of frames that are gone are gone"
 
 
 def test_single_frame_equals_the_same_frame_in_a_range(trained, take, quiet):
-    world, _ = trained
-    freeze_shot(world.shot, FreezeParams(take="one", **{**RANGE, "first": 107, "last": 107}), quiet())
-    one, whole = files(world.shot.take("one")), files(take[0])
+    freeze_shot(trained.shot, FreezeParams(take="one", **{**RANGE, "first": 107, "last": 107}), quiet())
+    one, whole = files(trained.shot.take("one")), files(take[0])
     assert len(one) == 3
     assert all(whole[name] == content for name, content in one.items())
 
@@ -139,16 +134,15 @@ freeze_shot(Shot.open(sys.argv[1]), FreezeParams(take=sys.argv[2], t_star=105, f
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
 def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
     """The process was killed after it had written a warp but not its frame."""
-    world, _ = trained
     name = "killed"
-    words = ["-P", "-c", CHILD, str(world.shot.root), name, str(ROOT)]
+    words = ["-P", "-c", CHILD, str(trained.shot.root), name, str(ROOT)]
     done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    folder = world.shot.take(name)
+    folder = trained.shot.take(name)
     left = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
     assert sorted(left) == ["000103.exr", "000104.exr", "000105.exr"]
     assert (folder / "warp" / "000106.exr").is_file()
-    freeze_shot(world.shot, FreezeParams(take=name, **RANGE, only_missing=True), quiet())
+    freeze_shot(trained.shot, FreezeParams(take=name, **RANGE, only_missing=True), quiet())
     assert files(folder) == files(take[0])
     assert all((folder / n).stat().st_mtime_ns == time for n, time in left.items())
     facts = [json.loads((f / "take.json").read_text())["detail"] for f in (folder, take[0])]
@@ -157,30 +151,28 @@ def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
 
 
 def test_frame_without_its_warp_is_rendered_again(trained, take, quiet):
-    world, _ = trained
     ask = FreezeParams(take="torn", **{**RANGE, "last": 104}, only_missing=True)
-    freeze_shot(world.shot, ask, quiet())
-    folder = world.shot.take("torn")
+    freeze_shot(trained.shot, ask, quiet())
+    folder = trained.shot.take("torn")
     before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
     (folder / "warp" / "000104.exr").unlink()
-    freeze_shot(world.shot, ask, quiet())
+    freeze_shot(trained.shot, ask, quiet())
     assert (folder / "warp" / "000104.exr").is_file()
     after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
     assert [name for name in after if after[name] != before[name]] == ["000104.exr"]
 
 
 def test_a_painted_matte_makes_frames_stale(trained, quiet):
-    world, _ = trained
     ask = FreezeParams(take="painted", develop="off", t_star=105, first=110, last=110, only_missing=True)
-    path = world.shot.root / PAINTED / "000110.png"
+    path = trained.shot.root / PAINTED / "000110.png"
     before = path.read_bytes()
     try:
         keys = []
         for matte in (None, None, np.full((48, 64), STILL, np.uint8)):
             if matte is not None:
                 write_matte(path, matte)
-            freeze_shot(world.shot, ask, quiet())
-            keys.append(read_key(world.shot.take("painted") / "000110.exr"))
+            freeze_shot(trained.shot, ask, quiet())
+            keys.append(read_key(trained.shot.take("painted") / "000110.exr"))
         assert keys[0] == keys[1] != keys[2]
     finally:
         path.write_bytes(before)
@@ -188,46 +180,31 @@ def test_a_painted_matte_makes_frames_stale(trained, quiet):
 
 def test_a_ramp_that_runs_is_the_clip(trained, quiet):
     """In frames at their own instant, pixels equal the plate up to half-float rounding. Later frames stay at 105."""
-    world, _ = trained
     ramp = {str(n): float(min(n, 105)) for n in range(101, 117)}
     part = dict(t_star_per_frame=ramp, first=104, last=106, develop="off")
-    freeze_shot(world.shot, FreezeParams(take="runs", **part), quiet())
-    plates = Plates(world.shot)
+    freeze_shot(trained.shot, FreezeParams(take="runs", **part), quiet())
+    plates = Plates(trained.shot)
     for n in (104, 105):
-        frame = read_frozen_exr(world.shot.take("runs") / f"{n:06d}.exr")
+        frame = read_frozen_exr(trained.shot.take("runs") / f"{n:06d}.exr")
         np.testing.assert_allclose(frame.rgba[..., :3], plates.linear(n), rtol=1e-3, atol=1e-6)
-    frozen = read_frozen_exr(world.shot.take("runs") / "000106.exr")
+    frozen = read_frozen_exr(trained.shot.take("runs") / "000106.exr")
     assert frozen.metadata.t_star_frame == 105.0 and (frozen.detail.source == 105).any()
 
 
 @pytest.fixture(scope="module")
 def bright(tmp_path_factory, world, quiet):
     """Static wall in half-float EXR at twice the size of the solve, with lamps of 50 and values below black."""
-    folder = tmp_path_factory.mktemp("bright")
-    (folder / "source").mkdir()
     rng = np.random.default_rng(4)
     lamps = [(int(y), int(x)) for y, x in rng.integers(4, 60, (12, 2))]
-    for n in range(16):
+
+    def picture_of(n):
         small = world.image(n, 0.0).numpy().astype(np.float32) ** 2.2
         picture = np.kron(small, np.ones((2, 2, 1), np.float32)) * rng.uniform(0.9, 1.1, (96, 128, 1))
         for k, (y, x) in enumerate(lamps):
             picture[y : y + 2, x : x + 2] = [50.0, 12.0, -0.02 * k]
-        spec = oiio.ImageSpec(128, 96, 3, "half")
-        out = oiio.ImageOutput.create(str(folder / "source" / f"a.{101 + n}.exr"))
-        assert out.open(str(folder / "source" / f"a.{101 + n}.exr"), spec)
-        assert out.write_image(picture.astype(np.float16)) and out.close()
-    shot = Shot.create(folder / "bright.splannequin")
-    import_footage(shot, str(folder / "source"), FootageConfig(working_height=48), quiet())
-    for name in ("cameras.json", "points.npz"):
-        shot.solve.mkdir(exist_ok=True)
-        (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
-    record = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
-    (shot.solve / "solve.json").write_text(json.dumps(record))
-    for n in range(101, 117):
-        write_png(shot.frames / f"{n:06d}.png", read_png(shot.frames / "raw" / f"{n:06d}.png"))
-        path = shot.root / PAINTED / f"{n:06d}.png"
-        path.parent.mkdir(exist_ok=True)
-        write_matte(path, np.full((48, 64), STILL, np.uint8))
+        return picture.astype(np.float16)
+
+    shot = film(world, tmp_path_factory.mktemp("bright"), picture_of, working_height=48)
     train_shot(shot, TrainParams(iterations=60, max_gaussians=900), quiet())
     return shot
 
@@ -277,29 +254,13 @@ LAMP = 20.0
 @pytest.fixture(scope="module")
 def lit(tmp_path_factory, world, quiet):
     """Trained shot of the wall in scene-linear EXR; its patch is a static lamp."""
-    folder = tmp_path_factory.mktemp("lit")
-    (folder / "source").mkdir()
-    state = world.at(0.0)
-    lamp = {name: value[world.moving] for name, value in state.items()}
-    for n in range(16):
-        view = dict(viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
-        covered = rasterize(**lamp, **view).alphas[0].numpy() > 0.5
+
+    def picture_of(n):
         picture = (0.8 * world.image(n, 0.0).numpy()) ** 2.2
-        picture[covered] = LAMP
-        path = str(folder / "source" / f"a.{101 + n}.exr")
-        out = oiio.ImageOutput.create(path)
-        assert out.open(path, oiio.ImageSpec(64, 48, 3, "half"))
-        assert out.write_image(picture.astype(np.float16)) and out.close()
-    shot = Shot.create(folder / "lit.splannequin")
-    import_footage(shot, str(folder / "source"), FootageConfig(), quiet())
-    shot.solve.mkdir(exist_ok=True)
-    for name in ("cameras.json", "points.npz"):
-        (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
-    for n in range(101, 117):
-        (shot.frames / f"{n:06d}.png").write_bytes((shot.raw / f"{n:06d}.png").read_bytes())
-        path = shot.root / PAINTED / f"{n:06d}.png"
-        path.parent.mkdir(exist_ok=True)
-        write_matte(path, np.full((48, 64), STILL, np.uint8))
+        picture[world.patch(n, 0.0) > 0.5] = LAMP
+        return picture.astype(np.float16)
+
+    shot = film(world, tmp_path_factory.mktemp("lit"), picture_of)
     train_shot(shot, TrainParams(iterations=300, max_gaussians=1500, method="static"), quiet())
     return shot
 

@@ -56,8 +56,7 @@ def splats_of(stage) -> PlyGaussians:
 @pytest.fixture(scope="module")
 def taken(trained, quiet):
     """The tiny shot with a splats-only take, frozen for a scene with a rotated floor and a scale."""
-    world, _ = trained
-    shot = world.shot
+    shot = trained.shot
     write_json(shot.placement, Placement(TURNED, 0.01, file_digest(shot.cameras)).to_json())
     try:
         facts = freeze_shot(shot, FreezeParams(take="placed", t_star=108, detail="off", develop="off"), quiet())

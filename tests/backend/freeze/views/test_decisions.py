@@ -28,8 +28,11 @@ def test_of_choices_that_are_equally_good_the_first_is_taken():
 def frame(trained):
     """frame(by): [H, W, 5] colour, support and motion from another pose, with Gaussians perturbed by the fraction
     `by`."""
-    world, _ = trained
-    run, scene, plates = load_run(world.shot, "main", torch.device("cpu")), load_scene(world.shot), Plates(world.shot)
+    run, scene, plates = (
+        load_run(trained.shot, "main", torch.device("cpu")),
+        load_scene(trained.shot),
+        Plates(trained.shot),
+    )
     compositor, (pose, t_star) = Compositor(run, scene, plates), (113, 106)
     size, i = (plates.width, plates.height), scene.frames.index(pose)
     output = OutputFrame(pose, scene.viewmats[i], scene.camera_at(*size)[i], float(t_star), float(pose))

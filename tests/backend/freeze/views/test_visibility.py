@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.freeze.views.visibility import visible_pixels
+from torch_backend.freeze.views.visibility import visible_by_operators, visible_pixels
 
 WIDTH, HEIGHT, TOLERANCE, SOFT = 37, 21, 0.03, 2.0
 
@@ -60,15 +60,19 @@ def single(*values):
     return [torch.from_numpy(np.asarray(value)).float() for value in values]
 
 
+BOTH = pytest.mark.parametrize("visible", [visible_pixels, visible_by_operators], ids=["processor", "card"])
+
+
+@BOTH
 @pytest.mark.parametrize("with_ignored", [False, True])
-def test_it_is_what_float64_says(plate, with_ignored):
+def test_it_is_what_float64_says(plate, with_ignored, visible):
     points, viewmat, K, surface, ignored = plate
     ignored = ignored if with_ignored else np.zeros_like(ignored)
     inputs = single(points, viewmat, K, surface, ignored)
     inputs = inputs if with_ignored else [*inputs[:-1], None]
     # Inputs are rounded to float32 first, so that only the arithmetic is tested.
     rounded = [np.asarray(v, np.float32).astype(float) for v in (points, viewmat, K, surface, ignored)]
-    found, expected = visible_pixels(*inputs, TOLERANCE, SOFT), reference(*rounded)
+    found, expected = visible(*inputs, TOLERANCE, SOFT), reference(*rounded)
     clear = np.abs(expected[1]) > 1e-3  # near the camera's plane, rounding decides which points are in front
     assert (expected[2] > 0.5).sum() > 100 and (expected[1] < 0).sum() > 500
     for name, mine, theirs in zip(("depth", "moving", "explained"), (found.depth, found.moving, found.explained),
@@ -92,10 +96,11 @@ def test_result_is_independent_of_threads_and_shape(plate):
     assert visible_pixels(points[:0], *camera, TOLERANCE, SOFT).depth.shape == (0,)
 
 
-def test_non_finite_points_are_invisible_and_read_in_bounds(plate):
+@BOTH
+def test_non_finite_points_are_invisible_and_read_in_bounds(plate, visible):
     _, *camera = single(*plate)
     odd = torch.tensor([[math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0], [0.0, -math.inf, 1.0], [1e30, 1e30, 1e30]])
-    found = visible_pixels(odd, *camera, TOLERANCE, SOFT)
+    found = visible(odd, *camera, TOLERANCE, SOFT)
     assert not bool((found.visible > 0.0).any())
     assert bool(found.moving.isfinite().all()) and bool(found.explained.isfinite().all())
 
