@@ -142,8 +142,7 @@ def start(job: Job, python: str, package_root: Path) -> None:
 def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
     """Reads the job's new output for about `budget_seconds`. Returns the new events.
 
-    If the child died without a final status, reads for up to a second more. Without a result there, its status is
-    rewritten as failed, with the end of its log.
+    If the child died without a final status, reads for up to a second more and then marks the job as failed.
     """
     until = time.monotonic() + budget_seconds
     status = _read_status(job.folder) or job.status
