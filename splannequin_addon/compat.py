@@ -1,4 +1,4 @@
-"""All differences between Blender 4.2 and 5.2 that the add-on handles, except those of animation."""
+"""Differences between Blender 4.2 and 5.2, except those of animation, and colour spaces, whose names differ as well."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from mathutils import Color
 from ..torch_backend.contract import PROBE, UserError
 
 if TYPE_CHECKING:
+    import gpu
     from bpy.stub_internal.rna_enums import PropertyFlagItems
 
 # Features are detected in Blender's type information, which also works in untested versions. Behaviours are not listed
@@ -21,6 +22,8 @@ HAS_TEXTURE_NODE = hasattr(bpy.types, "CompositorNodeTexture")
 """True if the compositor has a Texture node, which gives a pixel's position in the frame (until 5.0)."""
 CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
 """True if a cropping Scale node sets every pixel. Before 4.5 a row or column at the border is left unset."""
+SCALES_EXACTLY = bpy.app.version >= (4, 5, 0)
+"""True if a Scale node that keeps the size leaves every pixel unchanged. Before 4.5 it changes every pixel."""
 TURNS_VIDEOS = bpy.app.version >= (4, 5, 0)
 """True if Blender rotates a video by the quarter turns in its header. 4.2 and 4.3 do not; 4.4 was not tested."""
 
@@ -189,7 +192,7 @@ def new_fit_node(tree: bpy.types.NodeTree, how: str = "Fit") -> Any:
     """
     node: Any = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
-        node.inputs["Type"].default_value = "Render Size"
+        node.inputs["Type"].default_value = "Render Size"  # a menu socket's value is the English text of its item
     else:
         node.space = "RENDER_SIZE"
     set_fit(node, how)
@@ -308,8 +311,7 @@ def sized(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, size: tuple[i
 
     Before 4.5 it is `picture` itself.
     """
-    # Before 4.5, a Scale node changes every pixel, also without a change of size.
-    if not CROPS_WHOLE:
+    if not SCALES_EXACTLY:
         return picture
     node: Any = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
@@ -325,6 +327,17 @@ def sized(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, size: tuple[i
 def literal(path: str) -> str:
     """An output path that Blender uses literally: braces are doubled where Blender expands templates."""
     return path.replace("{", "{{").replace("}", "}}") if HAS_PATH_TEMPLATES else path
+
+
+def declare_depth_write(info: gpu.types.GPUShaderCreateInfo) -> None:
+    """Declares that a shader writes depth (4.4 on)."""
+    if hasattr(info, "depth_write"):  # OpenGL, the earlier default, needs no declaration
+        info.depth_write("ANY")
+
+
+def strips_of(editor: bpy.types.SequenceEditor) -> Any:
+    """Top-level strips of a sequence editor, which 4.4 renamed."""
+    return getattr(editor, "strips" if hasattr(editor, "strips") else "sequences")
 
 
 def set_png(settings: bpy.types.ImageFormatSettings) -> None:
@@ -378,7 +391,8 @@ def knows_colour(encoding: str | tuple[float, ...]) -> bool:
 def colour_space(encoding: str | tuple[float, ...]) -> str:
     """Name of an encoding's colour space in Blender's colour configuration (its own, or that of $OCIO).
 
-    The space is identified by its effect on a pixel, so its name does not matter. Raises ValueError if there is none.
+    The space is identified by its effect on a pixel. If none has the effect, a usual name of the encoding is used.
+    Raises ValueError if there is none either.
 
     Args:
         encoding: "linear" (Rec.709 primaries), "srgb", or the linear Rec.709 light that the file value `contract.PROBE`

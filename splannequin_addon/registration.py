@@ -6,8 +6,8 @@ and other parts to register.
 
 from __future__ import annotations
 
-import contextlib
 import functools
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
@@ -40,8 +40,8 @@ _PARTS: tuple[steps.Part, ...] = (
 )
 _PARTS_AFTER: tuple[steps.Part, ...] = (
     menu,
-    render_settings,  # first, because later handlers use the output path of a file being saved
-    places,  # before job_timer, whose load handler examines the shots
+    render_settings,  # before places: both handle save_pre, and places uses the output path
+    places,  # before job_timer: paths must be repaired before shots are looked up again
     *(part for step in _STEPS for part in step.parts),
     job_timer,
     command,
@@ -110,8 +110,7 @@ def _undo(calls: Sequence[Callable[[], None]]) -> None:
     """Unregisters parts in reverse order, then everything else that this add-on left registered after partial
     failures."""
     for call in reversed(calls):
-        with contextlib.suppress(Exception):
-            call()
+        _attempt(call)
     for name in dir(bpy.app.handlers):
         hooks: Any = getattr(bpy.app.handlers, name)
         if isinstance(hooks, list):
@@ -119,12 +118,20 @@ def _undo(calls: Sequence[Callable[[], None]]) -> None:
     if hasattr(bpy.types.Scene, "splannequin"):
         del bpy.types.Scene.splannequin  # pyright: ignore[reportAttributeAccessIssue]
     kinds = (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu, bpy.types.UIList, bpy.types.AddonPreferences)
-    # Property groups come last. A group is unregistered before the groups that it contains.
+    # Property groups come last. A group is unregistered before the groups that it contains. `__subclasses__` knows only
+    # direct subclasses, here and below: no class of ours is derived from another registered one.
     left = [cls for kind in (*kinds, bpy.types.PropertyGroup) for cls in reversed(kind.__subclasses__())]
     for cls in left:
         if _is_ours(cls) and getattr(cls, "is_registered", False):
-            with contextlib.suppress(Exception):
-                bpy.utils.unregister_class(cls)
+            _attempt(functools.partial(bpy.utils.unregister_class, cls))
+
+
+def _attempt(call: Callable[[], None]) -> None:
+    """Calls a function and prints its error, so that one part does not keep the others registered."""
+    try:
+        call()
+    except Exception:
+        traceback.print_exc()
 
 
 def _is_ours(thing: object) -> bool:

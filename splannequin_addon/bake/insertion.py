@@ -23,7 +23,6 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
     """Puts a take into the scene's compositor, or updates it. Returns the changes as sentences.
 
     Args:
-        scene: the scene.
         shot: shot folder.
         take: name of the take.
         warp: True: freeze the plate linked to the group. False: show the take's frames. None: unchanged.
@@ -172,7 +171,6 @@ def bring_in(scene: bpy.types.Scene, shot: Path, take: str, alone: bool = True) 
     """Inserts a take into the compositor and renders it, in steps run by the timer. Each step blocks Blender's window.
 
     Args:
-        scene: the scene.
         shot: shot folder.
         take: name of a take.
         alone: change only this scene, not other scenes that use the shot.

@@ -95,7 +95,7 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
             return {"CANCELLED"}
         notes = rendering.choose_output(scene, folder, settings_of(scene).take_name)
         if notes:
-            job_timer.undo_step("bake")
+            job_timer.undo_step("bake", wait=False)  # before the render changes settings for its duration
         run = rendering.Run(scene, check=cg_camera.check)
         try:
             run.begin(scene)

@@ -28,13 +28,13 @@ def began(shot: Path, run: rendering.Run) -> None:
     _runs[shot] = run
     _ended.pop(shot, None)
     watch = job_timer.watch_of(shot)
-    watch.work = Work("bake", None, _progress(run))
+    work = watch.work = Work("bake", None, _progress(run))
     idle = 0
 
     def tell(*_: int) -> None:
-        if watch.work is not None:
-            watch.work = Work("bake", None, _progress(run))
-            watch.redraw = True
+        # Runs in the render thread: it must not set `watch.work`, which Cancel may clear at the same time.
+        work.progress = _progress(run)
+        watch.redraw = True
 
     run.on_frame = tell
 

@@ -205,7 +205,7 @@ def _has_strips(scene: bpy.types.Scene) -> bool:
     """True if the scene's sequencer has strips."""
     editor: Any = scene.sequence_editor
     # Strips outside the frame range also replace the rendered image.
-    return editor is not None and bool(len(editor.strips if hasattr(editor, "strips") else editor.sequences))
+    return editor is not None and bool(len(compat.strips_of(editor)))
 
 
 def _is_linear(scene: bpy.types.Scene) -> bool:

@@ -24,7 +24,7 @@ _WIDE = 180.0
 
 
 def has_shoulder(shot_folder: contract.ShotFolder) -> bool:
-    """True if the working frames of a shot have a shoulder. False also if the record cannot be read."""
+    """True if the working frames of a shot have a shoulder. False also if frames.json cannot be read."""
     try:
         return contract.read_json(shot_folder.listing).get("display") == contract.SHOULDER
     except (OSError, ValueError, contract.JobError):

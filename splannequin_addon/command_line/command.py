@@ -11,13 +11,9 @@ from . import headless
 _handles: list[Any] = []
 
 
-def _main(arguments: list[str]) -> int:
-    return headless.main(arguments)
-
-
 def register() -> None:
     """Registers the command with Blender."""
-    _handles.append(bpy.utils.register_cli_command("splannequin", _main))
+    _handles.append(bpy.utils.register_cli_command("splannequin", headless.main))
 
 
 def unregister() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..access import scene_in, settings_of
-from ..process import backend, job_timer, steps
+from ..process import backend, steps
 from ..shot import selection
 from ..ui import icons, preferences, step_panel
 from ..ui.sentences import wrap
@@ -52,7 +52,7 @@ class ImportPanel(step_panel.StepPanel):
 
     def _backend_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Problem with the backend, or the state of its set-up."""
-        trouble, setup = job_timer.backend_trouble(), preferences.running_setup()
+        trouble, setup = backend.state()[1], preferences.running_setup()
         if setup is not None:
             wrap(layout, context, "The backend is being set up.", "IMPORT")
             for line in setup.output[-1:]:

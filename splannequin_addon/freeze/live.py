@@ -29,7 +29,7 @@ class Frame:
     """A rendered view of the frozen instant."""
 
     request: contract.LiveView
-    """The request."""
+    """The request that this frame answers."""
     t_star: int
     """Frame number at which time stands still: the requested one, or the nearest trained one."""
     rgba: np.ndarray
@@ -92,6 +92,11 @@ class Session:
         with self._change:
             return any(request.view == view for request in self._sent.values())
 
+    def instants(self) -> set[int]:
+        """Frame numbers at which time stands still in the newest frames."""
+        with self._change:  # the reader thread adds frames
+            return {frame.t_star for frame in self.frames.values()}
+
     def close(self) -> None:
         """Ends the child and returns at once. The child exits, and frees its memory, when it sees the end of its
         input."""
@@ -151,7 +156,8 @@ class Session:
             w, h = header["width"], header["height"]
             values = np.frombuffer(body, np.float32)
             rgba, depth = values[: 4 * w * h].reshape(h, w, 4), values[4 * w * h :].reshape(h, w)
-            self.frames[request.view] = Frame(request, header["t_star"], rgba, depth)
+            with self._change:
+                self.frames[request.view] = Frame(request, header["t_star"], rgba, depth)
             self.drawn += 1
 
     def _answered(self, seq: int) -> contract.LiveView:

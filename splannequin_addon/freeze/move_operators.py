@@ -152,8 +152,7 @@ class SPLANNEQUIN_OT_move_smooth(_Move, bpy.types.Operator):
     position = FloatProperty(
         name="Position",
         description="Strength with which the camera's position is stabilised. 1 removes sway with a period of "
-        "up to the "
-        "clip's length, 0.5 of up to half of it",
+        "up to the clip's length, 0.5 of up to half of it",
         default=0.25,
         min=0.0,
         max=1.0,
@@ -161,7 +160,7 @@ class SPLANNEQUIN_OT_move_smooth(_Move, bpy.types.Operator):
     )
     rotation = FloatProperty(
         name="Rotation",
-        description="Strength with which the camera's rotation is stabilised, with the same scale as the position",
+        description="0 to 1, as for Position: 1 removes sway with a period up to the clip's length",
         default=0.25,
         min=0.0,
         max=1.0,

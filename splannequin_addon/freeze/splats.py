@@ -57,21 +57,19 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
     columns = yield from reading(folder.ply)
     name = f"{scene_objects.name_of(shot)} {take} splats"
     mesh = bpy.data.meshes.new(name)
-    called = mesh.name
+    uid = mesh.session_uid  # a name may belong to a mesh of another file by then
     try:
         mesh.vertices.add(len(columns["x"]))
         for attribute in attributes(columns):
             # Until the next step an undo may free the data, and a kept reference would crash Blender.
             del mesh
             yield None
-            mesh = present(named(bpy.data.meshes, called))  # an undo may have removed it
+            mesh = scene_objects.needed_mesh(uid)
             _set(mesh, *attribute)
         scene = scene_objects.needed_scene(scene_uid)
         _facts(scene, shot, take)
     except BaseException:
-        left = named(bpy.data.meshes, called)
-        if left is not None:
-            bpy.data.meshes.remove(left)
+        scene_objects.remove_meshes([uid])
         raise
     _show(scene, shot, take, mesh, facts)
 

@@ -25,7 +25,7 @@ class Shape:
     corners: np.ndarray
     """[T, 3] int32, vertex indices of each triangle."""
     sides: np.ndarray
-    """[T, 3] int32, edge index of each triangle from each corner to the next."""
+    """[T, 3] int32, index into `edges` of the edge from corner k to corner k+1 of each triangle."""
 
 
 def begin(path: Path) -> Future[list[Shape]]:
@@ -37,7 +37,7 @@ def begin(path: Path) -> Future[list[Shape]]:
 
 
 def shapes(path: Path) -> list[Shape]:
-    """The room and the people of a surface. Raises ValueError as `read` does."""
+    """Shapes of a surface, as [room, people]. Raises ValueError as `read` does."""
     whole = read(path)
     return [_part(*whole, people) for people in (False, True)]
 

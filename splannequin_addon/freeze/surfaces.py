@@ -43,24 +43,21 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
     _facts(scene_objects.needed_scene(scene_uid), shot, take)
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
     parts = yield from _reading(folder.surface)
-    meshes: list[str] = []
+    meshes: list[int] = []  # numbers, because a name may belong to a mesh of another file by then
     try:
         for part, shape in zip(PARTS, parts, strict=True):
             mesh = bpy.data.meshes.new(f"{scene_objects.name_of(shot)} {take} {part}")
-            meshes.append(mesh.name)
+            meshes.append(mesh.session_uid)
             del mesh
             for fill in (_fill_elements, _fill_faces, _fill_colors) if len(shape.corners) else ():
                 yield None
-                fill(present(named(bpy.data.meshes, meshes[-1])), shape)  # an undo may have removed it
+                fill(scene_objects.needed_mesh(meshes[-1]), shape)
         scene = scene_objects.needed_scene(scene_uid)
         facts = _facts(scene, shot, take)
     except BaseException:
-        for name in meshes:
-            left = named(bpy.data.meshes, name)
-            if left is not None:
-                bpy.data.meshes.remove(left)
+        scene_objects.remove_meshes(meshes)
         raise
-    _show(scene, shot, take, [present(named(bpy.data.meshes, name)) for name in meshes], facts)
+    _show(scene, shot, take, [scene_objects.needed_mesh(uid) for uid in meshes], facts)
 
 
 def added_in_turns(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:

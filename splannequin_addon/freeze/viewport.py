@@ -1,8 +1,8 @@
 """Scrubbing: the backend's images of the frozen instant, composited by depth with the objects in the 3D view.
 
 A view requests an image of its content at a size that renders immediately. Once the view rests, it requests a sharper
-image, and then one with detail from the plates. The newest image is drawn until the next one arrives. Only the draw
-handler keeps bpy data between draws.
+image, and then one with detail from the plates. The newest image is drawn until the next one arrives. No bpy data is
+kept between draws, only GPU textures per region.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from gpu_extras.batch import batch_for_shader  # pyright: ignore[reportUnknownVa
 from mathutils import Matrix
 
 from ...torch_backend import contract
+from .. import compat
 from ..access import scene_in, settings_of
 from ..process import backend, job_timer
+from ..process.job_timer import redraw
 from ..shot import scene_objects, seen_camera, selection
 from . import hidden_points, live
 
@@ -85,7 +87,7 @@ def end() -> None:
     _moved.clear()
     _rested.clear()
     job_timer.drop(_tick)
-    redraw()
+    redraw(("WINDOW", "UI"))
 
 
 def instant(scene: bpy.types.Scene) -> float | None:
@@ -120,7 +122,7 @@ def reason(scene: bpy.types.Scene) -> str:
     if _session is None or not _session.facts:
         return "The backend is loading the run."
     at = instant(scene)
-    shown = {frame.t_star for frame in _session.frames.values()}
+    shown = _session.instants()
     for rank, one in enumerate(suggestions()):
         if one["frame"] == at:
             share, sharp = round(100 * one["seen"]), round(100 * one["sharpness"])
@@ -132,16 +134,6 @@ def reason(scene: bpy.types.Scene) -> str:
             )
     suggested = f"Suggested: {', '.join(str(one['frame']) for one in suggestions())}."
     return f"Shown: frame {shown.pop()}. " + suggested if len(shown) == 1 and at not in shown else suggested
-
-
-def redraw(kinds: tuple[str, ...] = ("WINDOW", "UI")) -> None:
-    """Redraws these regions of every 3D view."""
-    manager = bpy.context.window_manager
-    for window in manager.windows if manager else ():
-        for area in window.screen.areas:
-            for region in area.regions if area.type == "VIEW_3D" else ():
-                if region.type in kinds:
-                    region.tag_redraw()
 
 
 _last: tuple[int, tuple[Any, ...]] = (-1, ())
@@ -163,21 +155,13 @@ def _tick() -> float | None:
         return None
     for scene in scenes:
         _suggest(scene)
-    state = (
-        _session.drawn,
-        (
-            bool(_session.facts),
-            *(
-                (instant(s), p.live_show, p.detail, p.develop, s.frame_current)
-                for s in scenes
-                for p in [settings_of(s)]
-            ),
-        ),
-    )
+    state = _session.drawn, (bool(_session.facts), *map(_drawn_state, scenes))
     now = time.monotonic()
     # Depends on time, not on the number of ticks: without a graphics card one redraw may last longer than many ticks.
     resting = {v for v, moved in _moved.items() if now - moved > _REST_SECONDS} - _rested
     _rested.update(resting)
+    if resting:
+        _forget_closed_views(_session)
     if state != _last or resting:
         _last = state
         redraw(("WINDOW",))
@@ -187,6 +171,22 @@ def _tick() -> float | None:
         _last_reasons = reasons
         redraw(("UI",))
     return TICK_SECONDS
+
+
+def _drawn_state(scene: bpy.types.Scene) -> tuple[Any, ...]:
+    """The settings of a scene that its view shows."""
+    props = settings_of(scene)
+    return instant(scene), props.live_show, props.detail, props.develop, scene.frame_current
+
+
+def _forget_closed_views(drawn: live.Session) -> None:
+    """Drops the times, images and textures of views whose region no longer exists."""
+    areas = [area for window in bpy.context.window_manager.windows for area in window.screen.areas]
+    existing = {region.as_pointer() for area in areas for region in area.regions}
+    for view in _moved.keys() - existing:
+        del _moved[view]
+        drawn.frames.pop(view, None)
+        _shown.pop(view, None)
 
 
 def _moving(now: float) -> bool:
@@ -239,7 +239,7 @@ def _draw() -> None:
     t_star = instant(scene)
     if t_star is None:
         return
-    key = region.as_pointer() & 0x7FFFFFFF
+    key = region.as_pointer()
     size, matrices = (region.width, region.height), (view.view_matrix, view.window_matrix)
     quick, sharp = (view_of(scene, _session.shot, size, matrices, t_star, p) for p in (QUICK_PIXELS, SHARP_PIXELS))
     if quick is None or sharp is None:
@@ -316,8 +316,7 @@ def _shader_of() -> Any:
         info.sampler(0, "FLOAT_2D", "colour")
         info.sampler(1, "FLOAT_2D", "range")
         info.fragment_out(0, "VEC4", "painted")
-        if hasattr(info, "depth_write"):  # 4.4 on; OpenGL, the earlier default, does not need it
-            info.depth_write("ANY")
+        compat.declare_depth_write(info)
         info.vertex_source("void main() { at = vec2(pos.x, -pos.y) * 0.5 + 0.5; gl_Position = vec4(pos, 0.0, 1.0); }")
         info.fragment_source(
             """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from pathlib import Path
 
 import bpy
@@ -14,6 +15,9 @@ from . import children, environment, jobs
 PACKAGE: str = __name__.partition(".splannequin_addon.")[0]
 """Name of the extension package, such as bl_ext.user_default.splannequin."""
 PYTHON_VARIABLE = "SPLANNEQUIN_BACKEND_PYTHON"
+_STATE_SECONDS = 5.0
+# What `state` returns, with the time of that search in monotonic seconds; None before the first search.
+_state: tuple[str, contract.JobError | None, float] | None = None
 
 
 def package_root() -> Path:
@@ -96,6 +100,23 @@ def _environment_problem(python: Path) -> str:
         return f"The backend's set-up did not finish. The environment in {folder} is incomplete."
     changed = ", ".join(environment.changed(python))
     return f"The backend in {folder} has changed since it was set up: {changed}." if changed else ""
+
+
+def state() -> tuple[str, contract.JobError | None]:
+    """(the backend's interpreter, None), or ("", the reason why there is none). Cached for a few seconds."""
+    global _state  # cached, because panels ask at every redraw and `python` reads the disk
+    if _state is None or time.monotonic() - _state[2] > _STATE_SECONDS:
+        try:
+            _state = (python(), None, time.monotonic())
+        except contract.JobError as error:
+            _state = ("", error, time.monotonic())
+    return _state[:2]
+
+
+def clear_state() -> None:
+    """Makes the next `state` search again."""
+    global _state
+    _state = None
 
 
 def trouble() -> contract.JobError | None:

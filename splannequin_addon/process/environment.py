@@ -36,6 +36,8 @@ _SHOWN = 6
 
 def default_folder() -> Path:
     """Default folder of the environment."""
+    # Not a folder of the extension (`extension_path_user`): those belong to one Blender version, and Blender may remove
+    # them with the extension. All Blenders of a user share this environment of several gigabytes.
     if sys.platform == "win32":
         # Short, because packages nest deep and Windows limits paths to 260 characters.
         return Path(os.environ.get("LOCALAPPDATA") or Path.home()) / "Splannequin"
@@ -127,6 +129,15 @@ def poll(setup: SetUp) -> bool:
         setup.running = False
         setup.failure = "" if code == 0 else _why(setup, code)
     return before != (setup.output, setup.running)
+
+
+def wait(setup: SetUp) -> None:
+    """Blocks until a set-up has ended. Ctrl-C cancels it."""
+    try:
+        while poll(setup) or setup.running:
+            time.sleep(0.2)  # a wait without timeout cannot be interrupted on Windows
+    finally:
+        cancel(setup)
 
 
 def _why(setup: SetUp, code: int) -> str:

@@ -1,5 +1,6 @@
-"""Monitors running jobs from one persistent timer with a time budget per tick, and stores what the panel shows.
+"""Monitors running jobs from one persistent timer, and stores what the panel shows.
 
+A budget limits how long a tick reads events. A slice of work, a callback or a change of the scene limits itself.
 Jobs outlive undo, file load and Blender itself. This module therefore keeps no bpy data, only shot folders and job
 folders. The jobs of an opened shot are found in its folder.
 """
@@ -23,10 +24,10 @@ from ..scene import sequences
 from ..shot import inventory, markers, scene_objects, selection
 from ..shot.shot_state import ShotState
 from ..translations import tr
-from . import backend, children, jobs, steps
+from . import children, jobs, steps
 
 TICK_SECONDS = 0.25
-BUDGET_SECONDS = 0.01  # a timer callback blocks Blender's window
+BUDGET_SECONDS = 0.01  # for reading events: a timer callback blocks Blender's window
 WORKING_SECONDS = 0.04
 """Interval in seconds between slices of work done in Blender."""
 # Interval in seconds between checks of the shot folder for changes.
@@ -113,8 +114,6 @@ _callbacks: list[Callable[[], bool]] = []
 _pulses: list[Callable[[], float | None]] = []
 # Time of the next check of jobs while there are pulses, monotonic seconds.
 _jobs_next = 0.0
-# (the reason why there is no backend, time of that check in monotonic seconds).
-_backend: tuple[contract.JobError | None, float] = (None, 0.0)
 
 
 def watch_of(shot: Path) -> Watch:
@@ -134,16 +133,8 @@ def watch_of(shot: Path) -> Watch:
 
 
 def watches() -> list[Watch]:
-    """All watched shots."""
+    """States of all known shots."""
     return list(_watches.values())
-
-
-def backend_trouble() -> contract.JobError | None:
-    """The reason why there is no Python for the backend, or None. Cached for a few seconds."""
-    global _backend  # cached, because panels ask at every redraw
-    if not _backend[1] or time.monotonic() - _backend[1] > 5 * _LOOK_SECONDS:
-        _backend = (backend.trouble(), time.monotonic())
-    return _backend[0]
 
 
 def follow(step: str, job: jobs.Job) -> None:
@@ -239,11 +230,12 @@ def refresh(watch: Watch) -> bool:
 def pulse(turn: Callable[[], float | None]) -> None:
     """Calls `turn` from the timer after the delay in seconds that it returns, until it returns None or is dropped.
 
-    For anything drawn while it changes. Jobs are examined as often as without it.
+    For anything drawn while it changes. Jobs are still examined every 0.25 s.
     """
     drop(turn)
     _pulses.append(turn)
-    if bpy.app.timers.is_registered(tick):  # the next tick may be too late for an image
+    # The next tick may be too late for an image. Inside `tick`, Blender drops the running timer when it returns.
+    if bpy.app.timers.is_registered(tick):
         bpy.app.timers.unregister(tick)
         bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
@@ -294,6 +286,9 @@ def _follow_jobs() -> float:
                 traceback.print_exc()
             watch.failures[step] = (message, "See the console for details.")
             changed = True
+    if _watches:  # the next check begins with another shot, because one job may use up the whole budget
+        shot = next(iter(_watches))
+        _watches[shot] = _watches.pop(shot)
     for turn in list(_callbacks):
         try:
             goes_on = turn()
@@ -370,12 +365,13 @@ def _shown_state(job: jobs.Job) -> tuple[Any, ...]:
     return (shown, len(job.warnings), len(job.history), *job.images.values())
 
 
-def redraw() -> None:
-    """Redraws the sidebar of every 3D view."""
-    for window in bpy.context.window_manager.windows:
+def redraw(regions: tuple[str, ...] = ("UI",), editor: str = "VIEW_3D") -> None:
+    """Redraws these regions of every editor of a type. By default the sidebars, as a view may show a heavy scene."""
+    manager: Any = bpy.context.window_manager  # None while Blender quits
+    for window in manager.windows if manager else ():
         for area in window.screen.areas:
-            for region in area.regions if area.type == "VIEW_3D" else ():
-                if region.type == "UI":  # the view itself may show a heavy scene
+            for region in area.regions if area.type == editor else ():
+                if region.type in regions:
                     region.tag_redraw()
 
 
@@ -389,18 +385,30 @@ def look_through_camera(window: bpy.types.Window, camera: bpy.types.Object | Non
             space: Any = area.spaces.active
             if camera is not None:
                 space.use_local_camera, space.camera = True, camera
-            elif space.use_local_camera and (
-                space.camera is None or scene_objects.is_plate(space.camera)
-            ):  # or it no longer exists
+            # The local camera is None if the artist has deleted it.
+            elif space.use_local_camera and (space.camera is None or scene_objects.is_plate(space.camera)):
                 space.use_local_camera = False
             space.region_3d.view_perspective = "CAMERA"
             return
 
 
-def undo_step(step: str) -> None:
-    """Adds an undo step named after a step, for a change of the scene that no operator's undo covers."""
-    if not bpy.app.background:
-        bpy.ops.ed.undo_push(message=tr(f"Splannequin {steps.STEPS[step].label}"))
+def undo_step(step: str, wait: bool = True) -> None:
+    """Adds an undo step named after a step, for a change of the scene that no operator's undo covers.
+
+    With `wait`, it is added once no modal operator runs; otherwise at once.
+    """
+    message = tr(f"Splannequin {steps.STEPS[step].label}")
+
+    def push() -> bool:
+        # The timer also runs during a transform or a paint stroke, whose unfinished state the step would store.
+        if wait and any(window.modal_operators for window in bpy.context.window_manager.windows):
+            return True
+        # In Edit and Sculpt Mode, undo takes back the change and keeps the mode (Blender 4.2 and 5.2).
+        bpy.ops.ed.undo_push(message=message)
+        return False
+
+    if not bpy.app.background and push():
+        call_until_false(push)
 
 
 def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
@@ -451,10 +459,11 @@ def _on_load(*_: object) -> None:
     sequences.clear_prefetched()
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
-    redraw()
     for watch in _watches.values():
-        watch.work = None
+        stop_work(watch)
+        watch.work = None  # also work that Blender continued on its own
         watch.pending.clear()
+    redraw()
 
 
 def forget() -> None:

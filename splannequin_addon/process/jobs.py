@@ -140,9 +140,9 @@ def start(job: Job, python: str, package_root: Path) -> None:
 
 
 def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
-    """Reads the job's new output for at most about `budget_seconds`. Returns the new events.
+    """Reads the job's new output for about `budget_seconds`. Returns the new events.
 
-    If the child died without a final status, its status is rewritten as failed, with the end of its log.
+    If the child died without a final status, reads for up to a second more and then marks the job as failed.
     """
     until = time.monotonic() + budget_seconds
     status = _read_status(job.folder) or job.status
@@ -151,7 +151,7 @@ def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
         return events  # the job has ended, but the next poll must read its remaining events
     if (status is None or not status.ended) and not is_alive(job, status):
         status = _read_status(job.folder) or status  # the job may have ended between the two reads above
-        events += _read_events(job, until + 1.0)[0]
+        events += _read_events(job, until + 1.0)[0]  # once per job: its last events must be read before its status
         if status is None or not status.ended:
             status = _mark_failed(job, status)
     job.status = status

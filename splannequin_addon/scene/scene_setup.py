@@ -58,7 +58,6 @@ def fit_clip(
     """Sets the scene's size, rate and range to the clip's. Returns the changes as sentences.
 
     Args:
-        scene: the scene.
         size: width and height in pixels; None keeps the scene's.
         fps: frames per second; 0 keeps the scene's.
         frames: first and last frame, inclusive.
@@ -136,7 +135,7 @@ def keep_plate_colours(scene: bpy.types.Scene) -> list[str]:
 def note(scene: bpy.types.Scene, text: str) -> list[str]:
     """Writes a text into the metadata of rendered files, as Blender's Note. Returns the changes as sentences.
 
-    The artist's note stays. An empty text removes a note that was set here.
+    A note written by the artist is not changed. An empty text removes a note that was set here.
     """
     render = scene.render
     ours = json.loads(scene.get(_OURS, "{}")).get("render", {}).get("stamp_note_text")

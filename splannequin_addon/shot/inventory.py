@@ -359,7 +359,10 @@ _LONGEST_HISTORY = 1 << 24
 
 
 def _named(kind: type, folder: Path, file: str, damaged: dict[str, str]) -> dict[str, dict[str, Any]]:
-    """Name -> content of `file`, for every folder with a valid one. `damaged` gets name -> reason for invalid ones."""
+    """Name -> content of `file`, for every folder with a valid one.
+
+    Adds name -> reason to `damaged` for every invalid file.
+    """
     found: dict[str, dict[str, Any]] = {}
     for name in _names(folder, file):
         try:

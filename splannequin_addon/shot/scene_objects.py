@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 import bpy
@@ -102,7 +103,7 @@ def drop(scene: bpy.types.Scene, shot: Path) -> None:
 
 
 def part(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | None:
-    """One of `PARTS`, or the plate; None if the scene no longer has it."""
+    """The shot's object called `name` (one of `PARTS`, or "plate"); None if the scene no longer has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
     return item if item is not None and named(scene.objects, item.name) == item else None
@@ -203,6 +204,20 @@ def needed_scene(scene_uid: int) -> bpy.types.Scene:
     if scene is None:
         raise contract.JobError("The scene no longer exists.", "", contract.ExitCode.USAGE)
     return scene
+
+
+def needed_mesh(uid: int) -> bpy.types.Mesh:
+    """The mesh with this number, which a step fills in slices. Raises JobError if an undo has removed it."""
+    mesh = session.of(bpy.data.meshes, uid)
+    if mesh is None:
+        message = "The mesh was undone before it was complete."
+        raise contract.JobError(message, "Add it again.", contract.ExitCode.USAGE)
+    return mesh
+
+
+def remove_meshes(uids: Collection[int]) -> None:
+    """Removes the meshes with these numbers that still exist."""
+    bpy.data.batch_remove([mesh for mesh in bpy.data.meshes if mesh.session_uid in uids])
 
 
 def check_root(scene: bpy.types.Scene, shot: Path) -> None:

@@ -122,7 +122,6 @@ def _root(scene: bpy.types.Scene, shot: Path, pose: np.ndarray, size: float) -> 
     """The root of a shot in its collection. Both are created if missing.
 
     Args:
-        scene: the scene.
         shot: shot folder.
         pose: transform of a new root, [4, 4].
         size: display size of a new root.

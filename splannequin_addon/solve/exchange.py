@@ -34,7 +34,6 @@ def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> 
     """Solve parameters from the artist's settings. Writes cameras that Blender reads into the shot.
 
     Args:
-        scene: the scene.
         shot: shot folder, or None.
         is_read: the caller writes cameras for which `reads_in_turns` is True.
 

@@ -26,7 +26,6 @@ def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
     """Applies a world change from `alignment` to a shot's root. Returns the further changes as sentences.
 
     Args:
-        scene: the scene.
         shot: shot folder; the scene has its root.
         change: [4, 4], multiplied onto the root's matrix from the left.
     """
@@ -68,7 +67,6 @@ def guess_scale(scene: bpy.types.Scene, shot: Path, is_new: bool) -> list[str]:
     earlier estimate is undone.
 
     Args:
-        scene: the scene.
         shot: shot folder; the scene has its root.
         is_new: the root is new.
     """

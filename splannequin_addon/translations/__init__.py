@@ -1,9 +1,10 @@
 """The add-on in other languages: one file per locale, English sentence -> sentence.
 
-Sentences are composed, kept and logged in English, here and in the backend's process, and translated where they are
-shown: Blender looks up what its own widgets say (labels of buttons, tooltips), `tr` what was composed. `{}` in a key
-stands for any value, so that "74 frames, 1 to 74" is found under "{} frames, {} to {}". In the translation `{}` is the
-next value, `{1}` the second, `{!t}` a value that is itself translated, and `{!l}` a list of such values.
+Sentences are composed, kept and logged in English, here and in the backend's process. They are translated where they
+are shown, when their values are no longer known: `tr` therefore gets a whole sentence, not a template with values.
+Blender itself translates labels of buttons and tooltips. `{}` in a key stands for any value: "74 frames, 1 to 74" is
+found under "{} frames, {} to {}". In the translation `{}` is the next value, `{1}` the second, `{!t}` a value that is
+itself translated, and `{!l}` a list of such values.
 
 tests/addon/test_translations.py prints the lines that a language lacks.
 """

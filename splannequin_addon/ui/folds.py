@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 
 from ..access import scene_holding
-from ..process import job_timer, steps
+from ..process import backend, job_timer, steps
 from ..properties import BoolProperty
 from ..shot import selection
 
@@ -25,7 +25,7 @@ def current_step(scene: bpy.types.Scene) -> str:
     folder = selection.shot_folder(scene)
     watch = job_timer.watch_of(folder) if folder is not None else None
     names = list(steps.STEPS)
-    if watch is None or selection.missing(scene, watch.state) or job_timer.backend_trouble() is not None:
+    if watch is None or selection.missing(scene, watch.state) or backend.state()[1] is not None:
         return names[0]
     running, failed = watch.running(), watch.failed()
     if running or failed:

@@ -11,7 +11,7 @@ import bpy
 from ...torch_backend import contract
 from ..access import Icon, Outcome, layout_of
 from ..process import backend, children, environment, job_timer
-from ..properties import BoolProperty, EnumProperty, StringProperty
+from ..properties import EnumProperty, StringProperty
 from ..translations import tr
 from .sentences import wrap
 
@@ -23,6 +23,11 @@ _setup: environment.SetUp | None = None
 _findings: list[str] = []
 
 
+def _search_again(preferences: bpy.types.bpy_struct, context: bpy.types.Context) -> None:
+    """Property update: the page shows the backend of the new path at once."""
+    backend.clear_state()
+
+
 class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
     """Shown in Edit > Preferences > Add-ons > Splannequin."""
 
@@ -32,11 +37,13 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         name="Backend Python",
         description="Python interpreter of an existing backend environment; empty: detected automatically",
         subtype="FILE_PATH",
+        update=_search_again,
     )
     backend_folder = StringProperty(
         name="Folder",
         description="Folder in which Set Up Backend creates the environment; empty: a short path in your home folder",
         subtype="DIR_PATH",
+        update=_search_again,
     )
     backend_wheels = StringProperty(
         name="Wheels",
@@ -56,19 +63,14 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
     def draw(self, context: bpy.types.Context) -> None:
         """Draws the backend in use, its set-up and the device."""
         layout = layout_of(self)
-        try:
-            has_backend = bool(backend.python())
-            self._say(layout, f"In use: {backend.python()}", "CHECKMARK")
-        except contract.JobError as error:
-            if not busy():  # a set-up is running
-                column = layout.column(align=True)
-                column.alert = True
-                self._say(column, error.message, "ERROR")
-                self._say(column, error.hint, "BLANK1")
-            has_backend = False
+        python, trouble = backend.state()
+        if trouble is None:
+            _say(layout, f"In use: {python}", "CHECKMARK")
+        elif not busy():  # during a set-up, the missing backend is expected
+            _warn(layout, trouble.message, trouble.hint)
         for line in _findings:
-            self._say(layout, line, "DOT")
-        self._draw_setup(has_backend)
+            _say(layout, line, "DOT")
+        self._draw_setup(trouble is None)
         layout.prop(self, "device")
         layout.prop(self, "backend_python")
 
@@ -78,7 +80,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         row.enabled = not busy()
         row.prop(self, "backend_folder")
         if not self.backend_folder:
-            self._say(box, f"Without a folder, the backend is installed in {environment.default_folder()}.", "INFO")
+            _say(box, f"Without a folder, the backend is installed in {environment.default_folder()}.", "INFO")
         row = box.row()
         row.enabled = not busy()
         row.prop(self, "backend_wheels")
@@ -93,21 +95,27 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
                 row.operator("splannequin.remove_backend", icon="TRASH")
         if _setup is not None:
             for line in _setup.output if _setup.running else []:
-                self._say(box, line)
+                _say(box, line)
             if _setup.failure:
-                column = box.column(align=True)
-                column.alert = True
-                self._say(column, _setup.failure, "ERROR")
-                self._say(column, "Repair continues where the set-up stopped.", "BLANK1")
+                _warn(box, _setup.failure, "Repair continues where the set-up stopped.")
         elif not has_backend:
-            self._say(box, f"Creates a separate Python environment, {environment.SIZE}.", "INFO")
-            self._say(box, f"It installs {environment.LICENCES}.", "BLANK1")
+            _say(box, f"Creates a separate Python environment, {environment.SIZE}.", "INFO")
+            _say(box, f"It installs {environment.LICENCES}.", "BLANK1")
         if _is_offline():
-            self._say(box, _OFFLINE, "ERROR")
+            _say(box, _OFFLINE, "ERROR")
 
-    def _say(self, layout: bpy.types.UILayout, text: str, icon: Icon = "NONE") -> None:
-        """Draws a sentence, wrapped to the width of the page."""
-        wrap(layout, bpy.context, text, icon, margin=_INSET)
+
+def _say(layout: bpy.types.UILayout, text: str, icon: Icon = "NONE") -> None:
+    """Draws a sentence, wrapped to the width of the page."""
+    wrap(layout, bpy.context, text, icon, margin=_INSET)
+
+
+def _warn(layout: bpy.types.UILayout, message: str, hint: str) -> None:
+    """Draws an error and its remedy in red."""
+    column = layout.column(align=True)
+    column.alert = True
+    _say(column, message, "ERROR")
+    _say(column, hint, "BLANK1")
 
 
 _OFFLINE = (
@@ -145,12 +153,6 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
     bl_label = "Set Up Backend"
     bl_options = {"REGISTER"}
 
-    allow_online = BoolProperty(
-        name="Allow Online Access",
-        description="Tick Allow Online Access in Preferences > System > Network",
-        options={"SKIP_SAVE"},
-    )
-
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Disabled while a set-up runs."""
@@ -161,7 +163,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
         return context.window_manager.invoke_props_dialog(self, width=_DIALOG, confirm_text="Install")
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draws the downloads, their sources and checks, and the option to allow online access."""
+        """Draws the downloads, their sources and checks, and the way to the setting for online access."""
         column = layout_of(self).column(align=True)
         wheels = _wheels()
         size, places = environment.SIZE, environment.sources()
@@ -178,14 +180,13 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
         if _is_offline():
             column = layout_of(self).column(align=True)
             wrap(column, context, _OFFLINE, "ERROR", width=_DIALOG)
+            # Only the artist may turn it on: https://docs.blender.org/manual/en/latest/advanced/extensions/addons.html
             if not bpy.app.online_access_override:
-                column.prop(self, "allow_online")
+                column.operator("screen.userpref_show", text="Open System Preferences").section = "SYSTEM"
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Starts the set-up. Without a window, waits for its end."""
         global _setup
-        if _is_offline() and self.allow_online and not bpy.app.online_access_override:
-            context.preferences.system.use_online_access = True
         if _is_offline():
             self.report({"ERROR"}, tr(_OFFLINE))
             return {"CANCELLED"}
@@ -198,9 +199,8 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
         if not bpy.app.background:
             job_timer.call_until_false(_follow_setup)
             return {"FINISHED"}
-        if _setup.process is not None:
-            _setup.process.wait()
-        environment.poll(_setup)
+        environment.wait(_setup)
+        backend.clear_state()
         if _setup.failure:
             self.report({"ERROR"}, tr(_setup.failure))
             return {"CANCELLED"}
@@ -215,7 +215,7 @@ class SPLANNEQUIN_OT_cancel_setup(bpy.types.Operator):
     bl_options = {"INTERNAL"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Terminates the set-up."""
+        """Ends the set-up's process. Finished downloads and packages are kept."""
         if _setup is not None:
             environment.cancel(_setup)
         return {"FINISHED"}
@@ -256,13 +256,16 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks for confirmation."""
-        return context.window_manager.invoke_confirm(self, event)
+        """Asks for confirmation, with the folder that would be deleted."""
+        return context.window_manager.invoke_confirm(
+            self, event, title=tr("Remove Backend"), message=tr(f"Deletes {backend.folder() / '.venv'}."),
+            confirm_text=tr("Remove"), translate=False,
+        )  # fmt: skip
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Deletes the environment, unless it is in use."""
         if busy():
-            self.report({"ERROR"}, "The environment was not removed, because it is being set up")
+            self.report({"ERROR"}, tr("The environment was not removed, because it is being set up"))
             return {"CANCELLED"}
         for watch in job_timer.watches():
             if any(not job.ended for job in watch.jobs.values()):
@@ -284,7 +287,9 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
             self.report({"ERROR"}, tr(f"The environment was not removed: {error}"))
             return {"CANCELLED"}
         _findings.clear()
-        self.report({"INFO"}, "The backend's environment was removed" if was_removed else "There was nothing to remove")
+        backend.clear_state()
+        sentence = "The backend's environment was removed" if was_removed else "There was nothing to remove"
+        self.report({"INFO"}, tr(sentence))
         return {"FINISHED"}
 
 
@@ -323,10 +328,10 @@ def _follow_setup() -> bool:
 
 
 def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in ("PREFERENCES", "VIEW_3D"):
-                area.tag_redraw()
+    """Shows the backend's new state in the sidebars and the preferences."""
+    backend.clear_state()
+    job_timer.redraw()
+    job_timer.redraw(("WINDOW",), "PREFERENCES")
 
 
 _CLASSES = (

@@ -1,7 +1,7 @@
 """The sidebar tab "Splannequin" in the 3D view: five steps in order, with state and next action.
 
-The tab is one Blender panel. Each step is a layout panel in it, which `folds` opens and closes. Drawing only reads the
-job timer's stored state. It reads the disk only for a new shot.
+The tab is one Blender panel. Each step is a layout panel in it, which `folds` opens and closes. Drawing reads the
+job timer's stored state, and the disk only for a new shot, a job's log and, every few seconds, the backend and paces.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class StepPanel:
         """Draws controls that stay enabled while a step runs."""
 
     def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Draws the main settings."""
+        """Draws the settings above the step's button."""
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Draws settings that rarely need changes."""

@@ -93,6 +93,23 @@ def test_failing_callback_does_not_stop_the_timer(supervisor, capfd):
     assert capfd.readouterr().err.count("ZeroDivisionError") == 1
 
 
+def test_a_job_with_much_output_does_not_starve_the_others(addon, contract, supervisor, tmp_path):
+    """The first job uses up the whole budget of a check. The next check begins with the other one."""
+    jobs = []
+    for name, events in (("first", 200_000), ("second", 1)):
+        (tmp_path / name).mkdir()
+        job = addon("process.jobs").new_job(tmp_path / name, "import", contract.ImportParams(source="clip.mp4"))
+        line = json.dumps({"type": "note", "seq": 0, "time": 0.0, "data": {}}) + "\n"
+        (job.folder / contract.EVENTS_FILE).write_text(line * events, encoding="utf-8")
+        supervisor.follow("import", job)
+        jobs.append(job)
+    first, second = jobs
+    supervisor.tick()
+    assert 0 < first.read_to < (first.folder / contract.EVENTS_FILE).stat().st_size and not second.read_to
+    supervisor.tick()
+    assert second.read_to
+
+
 def test_bake_with_finished_frames_is_inserted_step_by_step(addon, contract, supervisor, watch, shot):
     """The turns are: read a picture, read the next, change the compositor, render. Blender blocks during each turn."""
     params = contract.FreezeParams(take="freeze")

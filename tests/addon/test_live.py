@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -95,6 +96,28 @@ def test_resting_view_is_requested_sharper_then_with_plate_detail(addon, contrac
     assert look(t_star=8.0) is None and session.open, "not asked for over and over"
 
 
+def test_frames_may_arrive_while_the_panel_reads_them(addon, contract, scene, monkeypatch):
+    """The reader thread adds frames of new views while the main thread reads the frames that are shown."""
+    viewport, live = addon("freeze.viewport"), addon("freeze.live")
+    session, views = live.Session(Path("shot"), "main"), 20000
+    session.facts = {"suggestions": [{"frame": 5, "seen": 1.0, "sharpness": 1.0}]}
+    monkeypatch.setattr(viewport, "_session", session)
+    scene.splannequin.choose_t_star, scene.splannequin.t_star = True, 6
+
+    def receive():
+        for n in range(views):
+            request = contract.LiveView(n, 0, VIEWMAT, [9.0, 9.0, 8.0, 6.0], 1, 1, 6.0)
+            session.ask(request)
+            _answer(session, request)
+
+    reader = threading.Thread(target=receive)
+    reader.start()
+    while reader.is_alive():
+        assert viewport.reason(scene) == "Suggested: 5."
+    reader.join()
+    assert len(session.frames) == views
+
+
 def test_switching_develop_sends_a_new_request(addon, contract):
     views = [contract.LiveView(1, 0, VIEWMAT, [9.0, 9.0, 8.0, 6.0], 16, 12, 6.0, develop=on) for on in (True, False)]
     same = addon("freeze.viewport")._same
@@ -120,6 +143,16 @@ def test_a_view_that_came_to_rest_is_drawn_once_more_however_late_the_timer_is(a
     scene.splannequin.detail = not scene.splannequin.detail
     viewport._tick()
     assert drawn.count(("WINDOW",)) == 2, "the switch is followed"
+
+
+def test_closed_views_free_their_images(addon, monkeypatch):
+    viewport, session = addon("freeze.viewport"), addon("freeze.live").Session(Path("shot"), "main")
+    region = bpy.context.window_manager.windows[0].screen.areas[0].regions[0].as_pointer()
+    for name in ("_moved", "_shown"):
+        monkeypatch.setattr(viewport, name, {region: 0.0, 1: 0.0})
+    session.frames.update({region: None, 1: None})
+    viewport._forget_closed_views(session)
+    assert viewport._moved.keys() == viewport._shown.keys() == session.frames.keys() == {region}
 
 
 def test_what_the_backend_warned_of_is_shown_while_it_draws(addon, shot, monkeypatch):

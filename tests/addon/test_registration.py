@@ -79,7 +79,7 @@ def test_what_fails_while_it_is_enabled_leaves_nothing_behind(package, addon, mo
     assert everything() == before, "and it can be enabled again"
 
 
-def test_a_part_that_cannot_be_taken_back_keeps_nothing_else(package, addon, monkeypatch):
+def test_a_part_that_cannot_be_taken_back_keeps_nothing_else(package, addon, monkeypatch, capfd):
     before = everything()
 
     def breaks() -> None:
@@ -88,7 +88,7 @@ def test_a_part_that_cannot_be_taken_back_keeps_nothing_else(package, addon, mon
     with monkeypatch.context() as patch:
         patch.setattr(addon("shot.places"), "unregister", breaks)
         package.unregister()
-    assert everything()[:2] == (set(), 0)
+    assert everything()[:2] == (set(), 0) and "AttributeError: it is broken" in capfd.readouterr().err
     package.register()
     assert everything() == before
 

@@ -178,6 +178,41 @@ def test_one_object_a_take(scene, shot, stood, addon, new_take):
     assert len([g for g in bpy.data.node_groups if g.name.startswith("Splannequin Splats")]) == 1
 
 
+def begin(scene, shot, addon):
+    """Start to add the splats by the timer, up to the first unfinished mesh. Returns the timer and the mesh."""
+    timer, before = addon("process.job_timer"), {mesh.session_uid for mesh in bpy.data.meshes}
+    timer.work(shot, "freeze", addon("freeze.splats").added_in_turns(scene.session_uid, shot, "freeze"))
+    for _ in range(20):
+        timer.tick()
+        mesh = next((m for m in bpy.data.meshes if m.session_uid not in before), None)
+        if mesh is not None:
+            return timer, mesh
+    raise AssertionError("no mesh was created")
+
+
+def test_another_file_keeps_its_mesh_of_the_same_name(scene, shot, stood, addon, tmp_path):
+    """Another file is opened while splats are added: its own data is not removed."""
+    placed_take(shot, addon, scene)
+    timer, mesh = begin(scene, shot, addon)
+    name = mesh.name
+    mesh.use_fake_user = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "B.blend"), copy=True)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "B.blend"))
+    assert name in bpy.data.meshes and all(watch.work is None for watch in timer.watches())
+
+
+def test_undo_before_the_splats_are_complete_is_a_sentence(scene, shot, stood, addon):
+    placed_take(shot, addon, scene)
+    for message in ("before", "also before"):
+        bpy.ops.ed.undo_push(message=message)
+    timer, _ = begin(scene, shot, addon)
+    bpy.ops.ed.undo()
+    timer.tick()
+    watch = timer.watch_of(shot)
+    assert watch.failures["freeze"] == ("The mesh was undone before it was complete.", "Add it again.")
+    assert watch.work is None and not [m for m in bpy.data.meshes if m.name.endswith("splats")]
+
+
 def test_splats_go_with_the_shot(scene, shot, stood, addon):
     placed_take(shot, addon, scene)
     bpy.ops.splannequin.add_splats()

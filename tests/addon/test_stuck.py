@@ -169,17 +169,16 @@ def test_a_listing_that_is_broken_shows_no_plate(addon, with_shot, with_raw):
 
 
 def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
-    supervisor = addon("process.job_timer")
-    monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
+    backend = addon("process.backend")
+    monkeypatch.setattr(backend, "_state", None)
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))
-    assert "does not exist" in supervisor.backend_trouble().message
+    assert "does not exist" in backend.state()[1].message
     monkeypatch.delenv("SPLANNEQUIN_BACKEND_PYTHON")
-    monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
+    backend.clear_state()
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("SPLANNEQUIN_HOME", str(tmp_path))
-    trouble = supervisor.backend_trouble()
+    trouble = backend.state()[1]
     assert trouble is None or "is not set up" in trouble.message
-    monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
 
 
 def test_interrupted_environment_is_not_accepted(addon, contract, monkeypatch, tmp_path):

@@ -87,6 +87,29 @@ def test_timer_inserts_a_finished_surface(scene, shot, stood, addon):
     assert timer.watch_of(shot).notes["freeze"] and not timer.watch_of(shot).failures
 
 
+@pytest.mark.parametrize("way", ["another file", "undo"])
+def test_interrupted_surface_removes_only_its_own_meshes(scene, shot, stood, addon, tmp_path, way):
+    timer = addon("process.job_timer")
+    for message in ("before", "also before"):
+        bpy.ops.ed.undo_push(message=message)
+    before = {mesh.session_uid for mesh in bpy.data.meshes}
+    timer.work(shot, "freeze", addon("freeze.surfaces").added_in_turns(scene.session_uid, shot, "freeze"))
+    while not (fresh := [m for m in bpy.data.meshes if m.session_uid not in before]):
+        timer.tick()
+    name, fresh[0].use_fake_user = fresh[0].name, True
+    del fresh
+    if way == "undo":
+        bpy.ops.ed.undo()
+        timer.tick()
+        failures = timer.watch_of(shot).failures
+        assert failures["freeze"] == ("The mesh was undone before it was complete.", "Add it again.")
+        assert name not in bpy.data.meshes
+        return
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "B.blend"), copy=True)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "B.blend"))
+    assert name in bpy.data.meshes and all(watch.work is None for watch in timer.watches())
+
+
 def test_what_the_artist_deletes_is_let_go(scene, shot, stood, addon):
     bpy.ops.splannequin.add_surface()
     bpy.data.objects.remove(found(addon, scene, shot)[1])
