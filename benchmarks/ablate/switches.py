@@ -96,8 +96,12 @@ def _as_it_was(room: Any, *_: Any) -> dict[str, Tensor]:
     return dict(room.frozen.state)
 
 
-def _no_residual(_: Tensor, places: Tensor) -> Tensor:
-    return torch.zeros(*places.shape[:-1], 3)
+def _no_residuals(original: Callable[..., Any]) -> Callable[..., Any]:
+    def filled(source_views: Any, config: Any, target: Any, fillers: Any, *args: Any) -> Any:
+        residuals = [torch.zeros_like(residual) for residual in fillers.residuals]
+        return original(source_views, config, target, dataclasses.replace(fillers, residuals=residuals), *args)
+
+    return filled
 
 
 def _none_undersampled(*args: Any, **_: Any) -> Tensor:
@@ -154,7 +158,7 @@ _FILL = (
     _number("sway", "no other time where something moves", sway_trust=0.0),
     _number("depth error", "plates are believed whatever the baseline", depth_error=0.0),
     _number("doubt", "what plates say is believed wholly", doubt=0.0),
-    Rule("residuals", "splats alone in the fill", switches=(Switch("composite.fill", "look_up_near", _no_residual),)),
+    Rule("residuals", "splats alone in the fill", switches=(Switch("composite.fill", "filled", _no_residuals, True),)),
 )  # fmt: skip
 
 

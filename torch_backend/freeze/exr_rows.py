@@ -18,6 +18,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from ..contract import open_regular
 from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet
 
@@ -110,4 +111,5 @@ def _header(spec: oiio.ImageSpec) -> bytes:
         if not (output.open(str(path), spec) and output.close()):
             raise OSError(f"OpenImageIO cannot write the header of an EXR: {output.geterror()}")
         chunks = -(-spec.height // _ROWS_OF_A_CHUNK)
-        return path.read_bytes()[: -8 * chunks]  # without the table of the chunks' places
+        with open_regular(path) as source:
+            return source.read()[: -8 * chunks]  # without the table of the chunks' places

@@ -40,7 +40,8 @@ from ..views.reproject import resized
 from ..views.source_views import MovingOf, PlateReader, SourceViews
 from ..views.target_view import TargetView, target_view
 from .config import CompositeConfig
-from .fill import Fillers, Filling, fill, fillers_of
+from .fill import Filling, fill, fillers_of
+from .filled import Fillers
 from .primary_source import PrimaryMatte, primary_matte, primary_plate
 from .transfer import to_display, to_linear
 from .warp import MATTE_STEPS, sample

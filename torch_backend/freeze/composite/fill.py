@@ -12,8 +12,9 @@ from ..views.decisions import above, first_best
 from ..views.reproject import blurred, dilate, erode, look_up, look_up_near, pair, project, resized, unproject
 from ..views.source_views import SourceViews
 from ..views.target_view import TargetView, displacements, parallax
-from ..views.visibility import Visibility
+from ..views.visibility import Visibility, visible_by_operators
 from .config import CompositeConfig
+from .filled import Filled, Fillers, filled
 from .warp import MATTE_STEPS
 
 FULL_MATTE = 1.0 - 0.5 / MATTE_STEPS
@@ -21,24 +22,6 @@ FULL_MATTE = 1.0 - 0.5 / MATTE_STEPS
 _ROUGH = 1
 """Radius, in pixels at decision resolution, of the surroundings that a plate must also show to fill a pixel near a
 mover. Depth is rough near movers, so visibility changes from pixel to pixel, and single pixels would stand out."""
-
-
-@dataclass
-class Fillers:
-    """The plates that fill the pixels not covered by the primary plate; lists have one item per plate."""
-
-    chosen: list[int]
-    """Frame numbers of the plates."""
-    moved: list[Tensor]
-    """[h, w, 3] scene flow of the visible surface from t* to the plate, scene units, at decision resolution."""
-    visible: list[Tensor]
-    """[h, w] in 0..1: the plate shows the surface and its surroundings."""
-    agreed: list[Tensor]
-    """[h, w] in 0..1: the plate and plate t* show the surface alike."""
-    residuals: list[Tensor]
-    """[H, W, 3] float16, as `SourceViews.residual`."""
-    most: float
-    """The largest value in any of the plates, and at least `Display.most`."""
 
 
 @dataclass
@@ -76,7 +59,12 @@ def fillers_of(
     agreed = _agreed(source_views, config, target, chosen, moved)
     residuals = [source_views.residual(frame) for frame in chosen]
     most = max(source_views.scene.display.most, *(source_views.most(frame) for frame in chosen))
-    return Fillers(chosen, moved, visible, agreed, residuals, most)
+    h, w = target.depth.shape
+    maps = target.points.new_zeros(h, w, (3 + 5 * len(chosen) + 15) // 16 * 16)
+    maps[..., 0], maps[..., 1], maps[..., 2] = target.motion, target.doubt, resized(target.image.motion, w, h)
+    for n in range(len(chosen)):
+        maps[..., 5 * n + 3 : 5 * n + 6], maps[..., 5 * n + 6], maps[..., 5 * n + 7] = moved[n], visible[n], agreed[n]
+    return Fillers(chosen, moved, visible, agreed, residuals, maps, most)
 
 
 def _visible_surroundings(
@@ -122,85 +110,86 @@ def _agreed(
 
 def fill(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, fillers: Fillers, matte: Tensor, rows: slice
-) -> Filling:
-    """Fills the pixels of some rows that the primary plate does not cover: splats plus weighted residuals of plates."""
+) -> Filling | None:
+    """Fills the pixels of some rows that the primary plate does not cover: splats plus weighted residuals of plates.
+
+    None if the plate covers all pixels of these rows.
+    """
     at = (matte[rows] < FULL_MATTE).nonzero()
-    y, x = at[:, 0], at[:, 1]
-    count = len(at)
-    device = matte.device
-    share, source = (torch.zeros(count, device=device) for _ in range(2))
-    filling = Filling(y, x, target.image.color[rows][y, x], share, source)
-    if not count:
-        return filling
-    pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
-    small = pixels * target.per_pixel
-    points = unproject(pixels, target.image.depth[rows][y, x], target.viewmat, target.K)
-    motion = look_up(target.motion, small)
-    plates, (w, h) = source_views.plates, source_views.size
-    larger = pair(plates.width / w, plates.height / h, pixels)
-    doubt = look_up(target.doubt, small)
-    uneasy = _uneasy(motion, doubt)
-    weights, places = list[Tensor](), list[Tensor]()
-    same_state, untold = torch.zeros(count, device=device), torch.ones(count, device=device)
-    truth = source_views.seen(target.t, points) if target.t in fillers.chosen else None
-    if truth is not None:  # the better plate t* shows a pixel, the less other times are needed
-        untold = 1.0 - _near(source_views, config, target, target.t, truth)
-    for n, frame in enumerate(fillers.chosen):
-        if truth is not None and frame == target.t:
-            visibility = truth
-        else:
-            visibility = source_views.seen(frame, points + look_up(fillers.moved[n], small))
-        visibility = _doubted(visibility, doubt)
-        around = torch.minimum(visibility.visible, look_up(fillers.visible[n], small))
-        visibility.visible = torch.lerp(visibility.visible, around, uneasy)
-        agreed = look_up(fillers.agreed[n], small)
-        unmoved = _unmoved(source_views, config, frame, points, visibility) * agreed
-        sway = config.sway_trust * unmoved * untold
-        still = 1.0 - doubt * (1.0 - agreed)
-        if frame != target.t:
-            same_state = torch.maximum(same_state, unmoved * _near(source_views, config, target, frame, visibility))
-        weights.append(_weight(source_views, config, target, frame, visibility, motion, sway, still))
-        places.append(visibility.pixels * larger)
-    believed = torch.stack(weights)
-    filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device=device)[first_best(believed)]
-    total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device=device)
-    filling.share = total / (total + config.doubt)
-    for n, residual in enumerate(fillers.residuals):
-        carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n])
-    filling.color += carried * filling.share[:, None]
-    if truth is not None:
-        at = fillers.chosen.index(target.t)
-        # A plate near in pose that shows nearly the same state has no reprojection error; plate t* may be a pixel off.
-        around = truth.visible * look_up(fillers.visible[at], small) * (1.0 - same_state)
-        _take_instant(source_views, config, target, filling, points, small, around, places[at])
-    filling.most = fillers.most
+    if not len(at):
+        return None
+    make = filled if matte.device.type == "cpu" else filled_by_operators
+    found = make(source_views, config, target, fillers, at, rows)
+    source = torch.tensor([float(frame) for frame in fillers.chosen], device=matte.device)[found.plate]
+    filling = Filling(at[:, 0], at[:, 1], found.color, found.share, source, fillers.most)
+    if target.t in fillers.chosen:
+        _take_instant(source_views, config, target, filling, found)
     return filling
 
 
+def filled_by_operators(
+    source_views: SourceViews, config: CompositeConfig, target: TargetView, fillers: Fillers, at: Tensor, rows: slice
+) -> Filled:
+    """`filled` by torch's operators, on any device."""
+    (y, x), c = at.unbind(1), source_views.config
+    pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
+    points = unproject(pixels, target.image.depth[rows][y, x], target.viewmat, target.K)
+    maps = look_up(fillers.maps, pixels * target.per_pixel)
+    motion, doubt, moves = maps[:, :3].unbind(-1)
+    plates, (w, h) = source_views.plates, source_views.size
+    larger = pair(plates.width / w, plates.height / h, pixels)
+
+    def seen(frame: int, where: Tensor) -> Visibility:
+        view = source_views.view(frame)
+        return visible_by_operators(
+            where, view.viewmat, view.K, view.surface, view.ignored, c.depth_tolerance, float(c.margin)
+        )
+
+    weights, places = list[Tensor](), list[Tensor]()
+    same_state, untold, instant = torch.zeros_like(motion), torch.ones_like(motion), torch.zeros_like(motion)
+    truth = seen(target.t, points) if target.t in fillers.chosen else None
+    if truth is not None:  # the better plate t* shows a pixel, the less other times are needed
+        untold = 1.0 - _near(source_views, config, target, target.t, truth)
+    for n, frame in enumerate(fillers.chosen):
+        way, around, agreed = maps[:, 5 * n + 3 : 5 * n + 6], maps[:, 5 * n + 6], maps[:, 5 * n + 7]
+        visibility = truth if truth is not None and frame == target.t else seen(frame, points + way)
+        if frame == target.t:
+            instant = visibility.visible * around * above(moves, 0.5)
+        visibility = _doubted(visibility, doubt)
+        around = torch.minimum(visibility.visible, around)
+        visibility.visible = torch.lerp(visibility.visible, around, _uneasy(motion, doubt))
+        unmoved = _unmoved(source_views, config, frame, points, visibility) * agreed
+        still = 1.0 - doubt * (1.0 - agreed)
+        if frame != target.t:
+            same_state = torch.maximum(same_state, unmoved * _near(source_views, config, target, frame, visibility))
+        sway = config.sway_trust * unmoved * untold
+        weights.append(_weight(source_views, config, target, frame, visibility, motion, sway, still))
+        places.append(visibility.pixels * larger)
+    believed = torch.stack(weights)
+    total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros_like(points)
+    for weight, residual, place in zip(believed, fillers.residuals, places, strict=True):
+        carried += (weight / total)[:, None] * look_up_near(residual, place)
+    share, k = total / (total + config.doubt), fillers.chosen.index(target.t) if truth is not None else 0
+    color = target.image.color[rows][y, x] + carried * share[:, None]
+    return Filled(color, share, first_best(believed), instant * (1.0 - same_state), places[k], points)
+
+
 def _take_instant(
-    source_views: SourceViews, config: CompositeConfig, target: TargetView, filling: Filling, points: Tensor,
-    small: Tensor, visible: Tensor, places: Tensor,
-) -> None:  # fmt: skip
+    source_views: SourceViews, config: CompositeConfig, target: TargetView, filling: Filling, found: Filled
+) -> None:
     """Uses plate t*'s own pixels in a filling where it shows movers from nearly the same side.
 
     Movers are learnt from plate t* alone, so their splats are only right from that camera. Seen from elsewhere, a
     face may fall apart although its depth is right, and a residual cannot repair that.
-
-    Args:
-        points: [P, 3] visible surface points, in scene units.
-        small: [P, 2] their pixels in the frame, at decision resolution.
-        visible: [P] in 0..1 visibility of each point and its surroundings in plate t*.
-        places: [P, 2] their pixels in plate t*, at the plate's size.
     """
-    h, w = target.depth.shape
-    moves = above(look_up(resized(target.image.motion, w, h), small), 0.5)
-    weight = visible * _facing(source_views, config, target, points) * moves
-    used = weight > 0.0
+    used = found.instant.nonzero()[:, 0]
+    weight = found.instant[used] * _facing(source_views, config, target, found.points[used])
+    used, weight = used[weight > 0.0], weight[weight > 0.0]
     gain, offset = _exposed(source_views, target, target.t)
-    instant_color = look_up_near(source_views.displayed(target.t), places[used]) * gain + offset
-    filling.color[used] = torch.lerp(filling.color[used], instant_color, weight[used][:, None])
-    filling.share = torch.lerp(filling.share, torch.ones_like(weight), weight)
-    filling.source = torch.where(weight > 0.5, float(target.t), filling.source)
+    instant_color = look_up_near(source_views.displayed(target.t), found.places[used]) * gain + offset
+    filling.color[used] = torch.lerp(filling.color[used], instant_color, weight[:, None])
+    filling.share[used] = torch.lerp(filling.share[used], torch.ones_like(weight), weight)
+    filling.source[used] = torch.where(weight > 0.5, float(target.t), filling.source[used])
 
 
 def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetView, points: Tensor) -> Tensor:

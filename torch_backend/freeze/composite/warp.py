@@ -36,7 +36,7 @@ from torch import Tensor
 from ...contract import UserError
 from ...footage.color import LIGHTS, in_light, light_matrix
 from ...torch_types import from_numpy
-from ..exr import check_finite, linear_spec, read_layers, read_light, set_margin, write_exr
+from ..exr import linear_spec, read_layers, read_light, set_margin, write_exr
 from ..views.reproject import pair
 
 CHANNELS = ("R", "G", "B", "A", "ST.X", "ST.Y", "ST.Z", "Matte.V")
@@ -166,15 +166,13 @@ def write_warp(
     for name, beyond in (("st", (2,)), ("fill", (3,)), ("alpha", ())):
         if arrays[name].shape != (*shape, *beyond):
             raise ValueError(f"{name} should be {[*shape, *beyond]} like matte, got shape {list(arrays[name].shape)}")
-    for name, layer in arrays.items():
-        check_finite(name, layer)
     spec = linear_spec(shape[1], shape[0], CHANNELS, _FORMATS, metadata.light)
     _describe(spec, metadata)
     set_margin(spec, margin)
     ones = np.broadcast_to(np.float32(1.0), (*shape, 1))
     fill_in_light = in_light(arrays["fill"], light_matrix(metadata.light))
-    parts = [fill_in_light, arrays["alpha"][..., None], arrays["st"], ones, arrays["matte"][..., None]]
-    return write_exr(Path(path), spec, parts)
+    parts = {"fill": fill_in_light, "alpha": arrays["alpha"], "st": arrays["st"], "one": ones, "matte": arrays["matte"]}
+    return write_exr(Path(path), spec, [*parts.values()], [*parts])
 
 
 def read_warp(path: str | Path) -> Warp:

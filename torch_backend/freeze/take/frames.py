@@ -21,7 +21,9 @@ from ...footage.images import write_png
 from ...scene import Scene
 from ...shot import disk_error, is_disk_full, need_disk
 from ...torch_types import from_numpy
+from .. import exr_rows
 from ..bands import bands
+from ..composite import grain, transfer
 from ..composite.compositor import CompositeFrame
 from ..composite.grain import Brush, Grain
 from ..composite.transfer import straight_to_linear, to_display
@@ -78,6 +80,8 @@ def _render_all(
     folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
     done = done if spec.debug_terms is None else set()  # debug terms of existing frames are not stored
     shares: dict[int, Tensor] = {}
+    for module in (exr_rows, grain, transfer):  # kernels that the writer's thread runs
+        module.warm_up()
     with BackgroundWriter() as out:
         for n, output in enumerate(frames):
             report.check_cancelled()
