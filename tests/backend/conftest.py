@@ -211,7 +211,7 @@ def trained_copy(trained, tmp_path_factory) -> World:
     Takes and instants of this copy do not affect other test files.
     """
     root = tmp_path_factory.mktemp("copy") / trained.shot.root.name
-    shutil.copytree(trained.shot.root, root)
+    shutil.copytree(trained.shot.root, root, ignore=shutil.ignore_patterns("takes"))
     return replace(trained, shot=Shot.open(root))
 
 
