@@ -14,12 +14,8 @@ _spec = importlib.util.spec_from_file_location("test_whole_file", Path(__file__)
 whole_file = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(whole_file)
 full = whole_file.full
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # reading the file's state touches deprecated properties
-    pytest.mark.skipif(
-        bpy.app.version < (4, 5, 0), reason="Blender 4.2 ends by SIGSEGV when UV sculpting's properties are read"
-    ),
-]
+# Reading the file's state touches deprecated properties.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 PLACES = [0.0, 0.0, 0.0, 1.0, 0.2, 0.1, 0.3, 1.0, 0.4]
 """Three non-collinear points."""

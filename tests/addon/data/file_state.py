@@ -11,6 +11,7 @@ _SPARED = {"all_ids", "window_managers", "workspaces", "screens", "libraries", "
 _UNREAD = {
     "bl_rna", "rna_type", "id_data", "session_uid", "original", "users", "tag", "pixels", "bindcode", "size",
     "channels", "depth", "resolution", "frame_duration", "animation_data", "fcurves", "file_format", "particle_edit",
+    "uv_sculpt",  # Blender 4.2 ends by SIGSEGV when it is read
 }  # fmt: skip
 """Properties that are not part of the file's data, or that Blender computes when something is drawn."""
 _DEPTH = 5
