@@ -12,7 +12,7 @@ def test_a_dry_run_goes_through_all_parts_of_a_stage(world, tmp_path):
     contents = sorted(world.shot.root.rglob("*"))
     assert gpu.main(["limits", "--dry-run", "--shot", str(world.shot.root), "--results", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "gpu-limits.json").read_text())
-    assert report["dry_run"] and set(report["found"]) == {"memory_6", "resume", "freeze", "live"}
+    assert report["dry_run"] and set(report["found"]) == {"memory_6", "resume", "freeze", "composite", "live"}
     assert not [name for name, part in report["found"].items() if "failed" in part]
     before, after = report["found"]["resume"]["cpu"]["gaussians"]
     assert after > before, "it was resumed at a round of growth"
