@@ -6,8 +6,9 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.addon.data.make_shot import png
 from tests.addon.data.pixels import read
-from tests.addon.test_mattes import HEIGHT, labels, matted, png  # noqa: F401 - a fixture
+from tests.addon.test_mattes import HEIGHT, labels, matted  # noqa: F401 - a fixture
 
 
 @pytest.fixture
