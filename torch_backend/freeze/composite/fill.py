@@ -64,7 +64,7 @@ def fillers_of(
     maps[..., 0], maps[..., 1], maps[..., 2] = target.motion, target.doubt, resized(target.image.motion, w, h)
     for n in range(len(chosen)):
         maps[..., 5 * n + 3 : 5 * n + 6], maps[..., 5 * n + 6], maps[..., 5 * n + 7] = moved[n], visible[n], agreed[n]
-    return Fillers(chosen, moved, visible, agreed, residuals, maps, most)
+    return Fillers(chosen, visible, agreed, residuals, maps, most)
 
 
 def _visible_surroundings(

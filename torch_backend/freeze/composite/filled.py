@@ -28,8 +28,6 @@ class Fillers:
 
     chosen: list[int]
     """Frame numbers of the plates."""
-    moved: list[Tensor]
-    """[h, w, 3] scene flow of the visible surface from t* to the plate, scene units, at decision resolution."""
     visible: list[Tensor]
     """[h, w] in 0..1: the plate shows the surface and its surroundings."""
     agreed: list[Tensor]
@@ -37,8 +35,8 @@ class Fillers:
     residuals: list[Tensor]
     """[H, W, 3] float16, as `SourceViews.residual`."""
     maps: Tensor
-    """[h, w, C] what `filled` looks up: motion, doubt, the splats' own motion, and of each plate `moved`, `visible` and
-    `agreed`. C is a multiple of 16."""
+    """[h, w, C] what `filled` looks up: motion, doubt, the splats' own motion, and of each plate the scene flow of the
+    visible surface from t* to it (3 channels, scene units), `visible` and `agreed`. C is a multiple of 16."""
     most: float
     """The largest value in any of the plates, and at least `Display.most`."""
 
