@@ -85,9 +85,9 @@ def why_unused(torch_cuda: str | None) -> tuple[str, str] | None:
     Args:
         torch_cuda: CUDA version that torch was built for; None for its CPU build.
     """
-    cards, trouble = nvidia_cards()
     if os.environ.get("CUDA_VISIBLE_DEVICES", "0") in ("", "-1"):
         return None
+    cards, trouble = nvidia_cards()
     if trouble:
         sentence = f"The NVIDIA driver does not answer: {trouble}"
         return sentence, "Restart the machine. If that does not help, reinstall the driver."

@@ -421,7 +421,7 @@ def stored_points(solve: ImportedSolve, matched: Matched, size: tuple[int, int])
     lenses = [solve.lenses[c.lens] for c in chosen]
     pictures = np.array([[*lens.params[:4], lens.width, lens.height] for lens in lenses])
     has_tracks = any(len(seen) for seen in solve.points["seen"])
-    track, depth = np.zeros(len(xyz)), np.full(len(xyz), -np.inf)
+    track, depth, scale = np.zeros(len(xyz)), np.full(len(xyz), -np.inf), np.ones(len(xyz))
     sight: list[NDArray[np.int64]] = []
     for n, seen in enumerate(solve.points["seen"]):
         at = poses[:, :, :3] @ xyz[n] + poses[:, :, 3]
@@ -430,9 +430,9 @@ def stored_points(solve: ImportedSolve, matched: Matched, size: tuple[int, int])
         else:
             rows = _in_picture(at, pictures)
         track[n] = len(rows)
-        depth[n] = at[rows, 2].min() if len(rows) else -np.inf
+        if len(rows):
+            depth[n], scale[n] = at[rows, 2].min(), (size[0] / pictures[rows, 4]).mean()
         sight.append(rows)
-    scale = size[0] / solve.lenses[0].width
     return {
         "xyz": xyz.astype(np.float32),
         "rgb": solve.points["rgb"],

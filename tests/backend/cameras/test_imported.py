@@ -272,8 +272,10 @@ def test_frames_that_are_trained_on_are_what_is_counted():
 def test_points_without_tracks_count_the_pictures_they_lie_in():
     lens = imported.Lens("PINHOLE", 100, 100, (100.0, 100.0, 50.0, 50.0))
     solve = fake_solve(3, lens=lens)
+    solve.lenses.append(imported.Lens("PINHOLE", 200, 200, (200.0, 200.0, 100.0, 100.0)))
     for n, camera in enumerate(solve.cameras):
         camera.pose = np.concatenate([np.eye(3), [[-1.5 * n], [0.0], [0.0]]], axis=1)
+        camera.lens = n % 2
     solve.points = {
         "xyz": np.array([[0.0, 0.0, 4.0], [0.0, 0.0, -4.0], [2.0, 0.0, 3.0]]),
         "rgb": np.zeros((3, 3), np.uint8),
@@ -285,7 +287,7 @@ def test_points_without_tracks_count_the_pictures_they_lie_in():
     assert points is not None
     assert points["track"].tolist() == [2, 0, 2]
     assert points["depth"].tolist() == [4.0, -np.inf, 3.0]
-    assert points["error"].tolist() == [2.0, 4.0, 0.0]
+    assert points["error"].tolist() == [1.5, 2.0, 0.0]  # mean of 2 and 1; no camera sees the second
     solve.points["seen"] = [np.array([0, 2]), np.array([1]), np.zeros(0, np.int64)]
     known_points = imported.stored_points(solve, matched, (200, 200))
     assert known_points is not None and known_points["track"].tolist() == [2, 1, 0]
