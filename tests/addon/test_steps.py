@@ -451,3 +451,26 @@ def test_chosen_look_reaches_the_request(addon, scene, clip, tmp_path):
     look.write_text("LUT_3D_SIZE 2\n" + "".join(f"{r} {g} {b}\n" for b in (0, 1) for g in (0, 1) for r in (0, 1)))
     scene.splannequin.clip, scene.splannequin.lut = str(clip), str(look)
     assert addon("process.steps").STEPS["import"].params(scene).lut == str(look)
+
+
+def test_the_artists_look_comes_back_unless_the_artists_new_view_lacks_it(addon, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    scene.view_settings.look = "AgX - Punchy"
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
+    assert (scene.view_settings.view_transform, scene.view_settings.look) == ("AgX", "AgX - Punchy")
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    scene.view_settings.view_transform = "Filmic"
+    assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}, "also without its view"
+    assert (scene.view_settings.view_transform, scene.view_settings.look) == ("Filmic", "None")
+    assert not [key for key in scene.keys() if key.startswith("splannequin_")]  # noqa: SIM118
+
+
+def test_a_stored_view_that_this_configuration_lacks_does_not_stop_a_removal(addon, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    stored = json.loads(scene["splannequin_settings_before"])
+    stored["view"]["view_transform"] = "ACES 1.0 - SDR Video"
+    scene["splannequin_settings_before"] = json.dumps(stored)
+    assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
+    assert scene.view_settings.view_transform == "Standard"
