@@ -24,7 +24,7 @@ from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
 # Settings of a shot that are paths.
-_SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "shot_seen")
+_SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "depth", "shot_seen")
 # Property of the scene's render settings: the output path, which may be ours.
 _OUTPUT = "filepath"
 # Paths of `_holders` from before the save, to be restored after it.
@@ -193,7 +193,7 @@ def _slashed(path: str) -> str:
 def _known(path: Path, name: str) -> bool:
     """True if the file or folder of the setting `name` exists. For a clip, its shot is sufficient."""
     try:
-        if name in ("clip", "cameras_path", "st_map", "lut", "ignore_path", "people_path"):
+        if name in ("clip", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "depth"):
             return _exists(path) or (
                 name == "clip" and contract.ShotFolder(selection.folder_of_clip(path)).info_path.is_file()
             )

@@ -59,7 +59,7 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     )
 
 
-@pytest.mark.parametrize("name", ["ignore_path", "people_path", "st_map", "cameras_path"])
+@pytest.mark.parametrize("name", ["ignore_path", "people_path", "st_map", "cameras_path", "depth"])
 def test_solve_inputs_are_found_in_a_moved_project(addon, project, name):
     (project / "given.exr").touch()
     setattr(bpy.context.scene.splannequin, name, str(project / "given.exr"))
