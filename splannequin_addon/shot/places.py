@@ -62,7 +62,8 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
         entry.name, entry.folder = scene_objects.name_of(folder), paths.blend_path(folder)
     for image in bpy.data.images:
         path = Path(paths.absolute(image.filepath))
-        if before is not None and image.get(TAG) and before in path.parents and not path.exists():
+        ours = image.get(TAG) and not image.library
+        if before is not None and ours and before in path.parents and not path.exists():
             image.filepath = paths.blend_path(folder / path.relative_to(before))
     for owner, name in _outside():
         path = Path(paths.absolute(_get(owner, name)))

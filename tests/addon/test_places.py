@@ -329,3 +329,25 @@ def test_a_keyed_camera_of_a_moved_shot_is_found(addon, shot):
     take_file = shot / "takes" / "freeze" / "take.json"
     take_file.write_text(json.dumps(json.loads(take_file.read_text()) | {"camera_path": "/nowhere/paths/freeze.json"}))
     assert addon("freeze.takes").take_params(shot, "freeze").camera_path == str(shot / "paths" / "freeze.json")
+
+
+def test_images_linked_from_the_same_shot_of_another_project_are_not_used(addon, project, tmp_path):
+    """Two projects made alike: what is linked from the one has the same relative paths as the other's images."""
+    other = Path(shutil.copytree(project, tmp_path / "other"))
+    blend(project)
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    blend(other)
+    with bpy.data.libraries.load(str(project / "work.blend"), link=True) as (there, here):
+        here.images = there.images
+    linked = {i.name: i.filepath for i in bpy.data.images if i.library}
+    bpy.context.scene.splannequin.shot_path = str(other / "people.splannequin")
+    bpy.ops.splannequin.load_camera()
+    bpy.ops.splannequin.insert_freeze()
+    image = bpy.context.scene.camera.data.background_images[0].image
+    assert image.library is None and plate_file() == other / "people.splannequin" / "frames" / "000005.png"
+    assert addon("bake.freeze_group").shown(bpy.context.scene)[0] == other / "people.splannequin" / "takes" / "freeze"
+    tree = addon("compat").compositor_tree(bpy.context.scene)
+    group = addon("bake.freeze_group").group_node(tree).node_tree
+    assert not [n for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image.library]
+    addon("scene.sequences").relative_images()
+    assert {i.name: i.filepath for i in bpy.data.images if i.library} == linked
