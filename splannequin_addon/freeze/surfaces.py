@@ -15,7 +15,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..access import named, present
+from ..access import holds, present
 from ..process import job_timer
 from ..scene.ownership import TAG
 from ..shot import inventory, placement, scene_objects
@@ -159,7 +159,7 @@ def find(scene: bpy.types.Scene, shot: Path, take: str) -> list[bpy.types.Object
     """The objects of a take's surface that the scene still has."""
     entry = scene_objects.of(scene, shot)
     items = [one.object for one in entry.surfaces if one.name == take] if entry is not None else []
-    return [item for item in items if item is not None and named(scene.objects, item.name) == item]
+    return [item for item in items if item is not None and holds(scene.objects, item)]
 
 
 def remove(scene: bpy.types.Scene, shot: Path, take: str | None = None) -> bool:

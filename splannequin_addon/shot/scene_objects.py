@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 
 from ...torch_backend import contract
-from ..access import named, settings_of
+from ..access import holds, named, settings_of
 from ..properties import BoolProperty, CollectionProperty, FloatProperty, Items, PointerProperty, StringProperty
 from ..scene import paths, session
 
@@ -106,7 +106,7 @@ def part(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | No
     """The shot's object called `name` (one of `PARTS`, or "plate"); None if the scene no longer has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
-    return item if item is not None and named(scene.objects, item.name) == item else None
+    return item if item is not None and holds(scene.objects, item) else None
 
 
 def keep_camera(scene: bpy.types.Scene) -> None:
@@ -122,7 +122,7 @@ def restore_camera(scene: bpy.types.Scene) -> None:
     props = settings_of(scene)
     if scene.camera is None:
         candidates = [entry.camera for entry in props.made] + [props.camera_before]
-        scene.camera = next((c for c in candidates if c is not None and named(scene.objects, c.name) == c), None)
+        scene.camera = next((c for c in candidates if c is not None and holds(scene.objects, c)), None)
     if not len(props.made):
         props.camera_before = None
 
