@@ -177,7 +177,7 @@ def _keep(scene: bpy.types.Scene, shot: Path, take: str, items: list[bpy.types.O
     for item in items:
         for collection in item.users_collection:
             collection.objects.unlink(item)
-        present(entry.collection).objects.link(item)
+        scene_objects.own_collection(scene, shot).objects.link(item)
         item.parent, item.matrix_parent_inverse = root, Matrix()
         item.matrix_basis = transform @ item.matrix_basis
     kept = entry.splats.add()

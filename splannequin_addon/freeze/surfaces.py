@@ -144,7 +144,7 @@ def _show(scene: bpy.types.Scene, shot: Path, take: str, meshes: list[bpy.types.
             continue
         mesh.materials.append(_material())
         item = bpy.data.objects.new(mesh.name, mesh)
-        present(entry.collection).objects.link(item)
+        scene_objects.own_collection(scene, shot).objects.link(item)
         item.parent, item.matrix_parent_inverse, item.matrix_basis = root, Matrix(), transform
         # A holdout would also hide objects behind people. But it would cast people's shadows, which the plate already
         # has, and it would not catch any shadows.

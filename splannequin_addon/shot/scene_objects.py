@@ -95,6 +95,15 @@ def new(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made:
     return entry
 
 
+def own_collection(scene: bpy.types.Scene, shot: Path) -> bpy.types.Collection:
+    """The collection of the shot's objects, created if the scene no longer has it."""
+    entry = new(scene, shot)
+    if entry.collection is None or entry.collection not in scene.collection.children_recursive:
+        entry.collection = bpy.data.collections.new(f"Splannequin {name_of(shot)}")
+        scene.collection.children.link(entry.collection)
+    return entry.collection
+
+
 def drop(scene: bpy.types.Scene, shot: Path) -> None:
     """Removes the entry of a shot. Its objects stay."""
     entry = of(scene, shot)
