@@ -473,3 +473,13 @@ def test_a_camera_linked_under_the_same_name_is_not_read_instead(addon, moving, 
     name = addon("freeze.own_camera").name_of(moving)
     path = run_out(addon("freeze.own_camera").sample_path(moving, name, shot, 64))
     assert len({tuple(frame.viewmat) for frame in path.frames}) == 1, "the linked one does not"
+
+
+def test_muted_keyframes_of_t_star_are_not_followed(addon, scene, shot):
+    props = scene.splannequin
+    props.shot_path, props.choose_t_star, props.t_star = str(shot), True, 5
+    props.keyframe_insert("t_star", frame=5)
+    (curve,) = addon("compat_animation").fcurves(scene)
+    assert addon("freeze.takes").keyed_instants(scene)
+    curve.mute = True
+    assert addon("freeze.takes").keyed_instants(scene) == {}
