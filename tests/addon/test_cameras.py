@@ -483,3 +483,16 @@ def test_muted_keyframes_of_t_star_are_not_followed(addon, scene, shot):
     assert addon("freeze.takes").keyed_instants(scene)
     curve.mute = True
     assert addon("freeze.takes").keyed_instants(scene) == {}
+
+
+def test_an_action_without_a_slot_for_the_scene_has_no_curves(addon, scene):
+    action = bpy.data.actions.new("of others")
+    if not hasattr(action, "slots"):
+        pytest.skip("since 4.4")
+    scene.animation_data_create().action = action
+    other = action.slots.new("OBJECT", "other")
+    strip = action.layers.new("Layer").strips.new(type="KEYFRAME")
+    strip.channelbag(other, ensure=True).fcurves.new("location", index=0)
+    assert scene.animation_data.action_slot is None
+    assert list(addon("compat_animation").fcurves(scene)) == []
+    addon("compat_animation").remove_fcurves(scene, "splannequin.t_star")
