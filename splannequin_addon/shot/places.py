@@ -19,7 +19,7 @@ from bpy.app.handlers import persistent
 from ...torch_backend import contract
 from ..access import library_of, settings_of
 from ..scene import paths
-from ..scene.ownership import BAKES, DIGITS, MATTE_SHOT, TAG
+from ..scene.ownership import MATTE_SHOT, TAG, rendered_of
 from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
@@ -67,7 +67,7 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
             image.filepath = paths.blend_path(folder / path.relative_to(before))
     for owner, name in _outside():
         path = Path(paths.absolute(_get(owner, name)))
-        if before is not None and before in (path, _rendered_of(path)) and not before.exists():
+        if before is not None and before in (path, rendered_of(path)) and not before.exists():
             _set(owner, name, paths.blend_path(folder / path.relative_to(before)))
     props.shot_path = props.shot_seen = paths.blend_path(folder)
     source = source_of(state)
@@ -107,12 +107,6 @@ def _set(owner: bpy.types.bpy_struct, name: str, path: str) -> None:
         owner[name] = path
     else:
         setattr(owner, name, path)
-
-
-def _rendered_of(path: Path) -> Path | None:
-    """The shot of an output path of ours; None for the artist's path."""
-    ours = path.name == DIGITS and len(path.parents) > 2 and path.parents[1].name == BAKES
-    return path.parents[2] if ours else None
 
 
 def _relative(path: str, base: str) -> str:
@@ -198,7 +192,7 @@ def _known(path: Path, name: str) -> bool:
             return _exists(path) or (
                 name == "clip" and contract.ShotFolder(selection.folder_of_clip(path)).info_path.is_file()
             )
-        shot = _rendered_of(path) if name == _OUTPUT else path
+        shot = rendered_of(path) if name == _OUTPUT else path
         return shot is not None and contract.ShotFolder(shot).info_path.is_file()
     except OSError:
         return False

@@ -474,3 +474,19 @@ def test_a_stored_view_that_this_configuration_lacks_does_not_stop_a_removal(add
     scene["splannequin_settings_before"] = json.dumps(stored)
     assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
     assert scene.view_settings.view_transform == "Standard"
+
+
+def test_each_take_has_its_own_folder_of_rendered_images(addon, with_shot, shot, tmp_path, new_take):
+    rendering, second_shot = addon("bake.rendering"), tmp_path / "second.splannequin"
+    new_take(shot, "later")
+    shutil.copytree(shot, second_shot)
+    rendering.choose_output(with_shot, shot, "freeze")
+    assert rendering.choose_output(with_shot, shot, "later")
+    assert Path(with_shot.render.filepath) == shot / "bake" / "later" / "######"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
+    scene = bpy.context.scene
+    assert rendering.choose_output(scene, shot, "later") == []
+    assert rendering.choose_output(scene, second_shot, "later"), "nor is one shot rendered over another"
+    assert Path(bpy.path.abspath(scene.render.filepath)) == second_shot / "bake" / "later" / "######"
+    scene.render.filepath = artists = "//second.splannequin/bake/later v2/######"
+    assert rendering.choose_output(scene, shot, "later") == [] and scene.render.filepath == artists
