@@ -83,11 +83,16 @@ def _exists(path: Path) -> bool:
 def _holders() -> Iterator[tuple[Any, str]]:
     """(owner, property) of every path of ours in the file."""
     for scene in [s for s in bpy.data.scenes if not library_of(s)]:
-        props = settings_of(scene)
-        for one in [props, *props.shots]:
-            yield from ((one, name) for name in _SETTINGS)
-        yield from ((entry, "folder") for entry in props.made)
+        yield from _holders_in(scene)
     yield from _outside()
+
+
+def _holders_in(scene: bpy.types.Scene) -> Iterator[tuple[Any, str]]:
+    """`_holders` in the settings of a scene."""
+    props = settings_of(scene)
+    for one in [props, *props.shots]:
+        yield from ((one, name) for name in _SETTINGS)
+    yield from ((entry, "folder") for entry in props.made)
 
 
 def _outside() -> Iterator[tuple[Any, str]]:
@@ -162,6 +167,23 @@ def _after_load(*_: object) -> None:
             _set(owner, name, paths.blend_path(found))
 
 
+@persistent
+def _after_import(context: Any, *_: object) -> None:
+    """Handler: relative paths of appended data started at the file that they come from."""
+    for item in context.import_items:
+        block = item.id
+        if item.append_action not in ("MAKE_LOCAL", "COPY_LOCAL") or item.source_library is None:
+            continue
+        holders: list[tuple[Any, str]] = list(_holders_in(block)) if isinstance(block, bpy.types.Scene) else []
+        if isinstance(block, bpy.types.Image) and isinstance(block.get(MATTE_SHOT), str):
+            holders.append((block, MATTE_SHOT))
+        origin = os.path.dirname(bpy.path.abspath(item.source_library.filepath))
+        for owner, name in holders:
+            path = _get(owner, name)
+            if path.startswith("//"):
+                _set(owner, name, paths.blend_path(Path(bpy.path.abspath(path, start=origin))))
+
+
 def _read_backslashes() -> None:
     """Converts relative paths of a file saved on Windows to slashes on other systems, as Blender does with its
     paths."""
@@ -203,6 +225,7 @@ _HANDLERS = (
     ("save_post", _after_save),
     ("save_post_fail", _after_save),
     ("load_post", _after_load),
+    *((("blend_import_post", _after_import),) if hasattr(bpy.app.handlers, "blend_import_post") else ()),  # 4.3 on
 )
 
 

@@ -351,3 +351,28 @@ def test_images_linked_from_the_same_shot_of_another_project_are_not_used(addon,
     assert not [n for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image.library]
     addon("scene.sequences").relative_images()
     assert {i.name: i.filepath for i in bpy.data.images if i.library} == linked
+
+
+@pytest.mark.skipif(not hasattr(bpy.app.handlers, "blend_import_post"), reason="since 4.3")
+@pytest.mark.parametrize("is_saved", [True, False])
+def test_an_appended_scene_keeps_its_shot(addon, project, tmp_path, is_saved):
+    """The other folder has a shot of the same name, as a second project made by the command line has."""
+    other, scene = Path(shutil.copytree(project, tmp_path / "other")), bpy.context.scene
+    scene.name = "Layout"
+    painted_on(project / "people.splannequin")
+    blend(project)
+    assert scene.splannequin.clip == "//people.mp4"
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    if is_saved:
+        blend(other)
+    with bpy.data.libraries.load(str(project / "work.blend"), link=False) as (_, here):
+        here.scenes, here.images = ["Layout"], ["Motion"]
+    scene = bpy.data.scenes["Layout"]
+    assert scene.library is None
+    assert addon("shot.selection").shot_folder(scene) == project / "people.splannequin"
+    assert addon("scene.paths").absolute(scene.splannequin.clip) == str(project / "people.mp4")
+    assert addon("solve.cameras").find(scene, project / "people.splannequin", "CAMERA") is not None
+    assert addon("solve.mattes").find_image(project / "people.splannequin", 6) is not None
+    blend(other)
+    assert addon("shot.selection").shot_folder(scene) == project / "people.splannequin"
+    assert scene.splannequin.clip == "//../project/people.mp4"
