@@ -78,14 +78,23 @@ def name_of(shot: Path) -> str:
 def of(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made | None:
     """The entry of a shot's objects, or None."""
     # Panels call this while drawing, when Blender forbids writes.
-    for entry in settings_of(scene).made:
-        if entry.name != name_of(shot):
-            continue
-        folder = os.path.abspath(paths.absolute(entry.folder))
-        # A different path is another shot of the same name, unless the shot was moved here since.
-        if paths.same(folder, os.path.abspath(shot)) or not os.path.isdir(folder):
+    alike = [entry for entry in settings_of(scene).made if entry.name == name_of(shot)]
+    folders = [os.path.abspath(paths.absolute(entry.folder)) for entry in alike]
+    for entry, folder in zip(alike, folders, strict=True):
+        if paths.same(folder, os.path.abspath(shot)):
+            return entry
+    # A different path is another shot of the same name, unless the shot was moved here since.
+    for entry, folder in zip(alike, folders, strict=True):
+        if not os.path.isdir(folder) and not _is_of_another(scene, folder):
             return entry
     return None
+
+
+def _is_of_another(scene: bpy.types.Scene, folder: str) -> bool:
+    """True if a missing folder is that of a shot in the scene's list that is not selected. Its disk may be away."""
+    props = settings_of(scene)
+    others = [one for index, one in enumerate(props.shots) if index != props.loaded_shot]
+    return any(paths.same(paths.absolute(one.shot_seen), folder) for one in others)
 
 
 def new(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made:
