@@ -61,7 +61,7 @@ def choose_output(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
 
 def _is_default_of_a_take(path: str) -> bool:
     """True if an output path is the default of an existing take, whose images must not be overwritten by others'."""
-    folder = Path(paths.absolute(path)).parent
+    folder = Path(compat.unescaped(paths.absolute(path))).parent
     shot = rendered_of(folder / DIGITS) if Path(path).name == DIGITS else None
     return shot is not None and contract.TakeFolder(contract.ShotFolder(shot).take(folder.name)).facts.is_file()
 

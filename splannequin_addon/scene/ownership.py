@@ -14,6 +14,6 @@ DIGITS = "######"
 
 
 def rendered_of(path: Path) -> Path | None:
-    """The shot of an output path of ours; None for the artist's path."""
+    """The shot of an output path of ours, given without escapes of braces; None for the artist's path."""
     ours = path.name == DIGITS and len(path.parents) > 2 and path.parents[1].name == BAKES
     return path.parents[2] if ours else None

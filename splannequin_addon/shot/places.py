@@ -17,6 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
+from .. import compat
 from ..access import library_of, settings_of
 from ..scene import paths
 from ..scene.ownership import MATTE_SHOT, TAG, rendered_of
@@ -67,8 +68,12 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
             image.filepath = paths.blend_path(folder / path.relative_to(before))
     for owner, name in _outside():
         path = Path(paths.absolute(_get(owner, name)))
-        if before is not None and before in (path, rendered_of(path)) and not before.exists():
-            _set(owner, name, paths.blend_path(folder / path.relative_to(before)))
+        if before is None or before.exists():
+            continue
+        if path == before:
+            _set(owner, name, paths.blend_path(folder))
+        elif before == rendered_of(Path(compat.unescaped(str(path)))):
+            _set(owner, name, compat.literal(paths.blend_path(folder / path.relative_to(path.parents[2]))))
     props.shot_path = props.shot_seen = paths.blend_path(folder)
     source = source_of(state)
     if source and not (props.clip and _exists(Path(paths.absolute(props.clip)))):
@@ -214,7 +219,7 @@ def _known(path: Path, name: str) -> bool:
             return _exists(path) or (
                 name == "clip" and contract.ShotFolder(selection.folder_of_clip(path)).info_path.is_file()
             )
-        shot = rendered_of(path) if name == _OUTPUT else path
+        shot = rendered_of(Path(compat.unescaped(str(path)))) if name == _OUTPUT else path
         return shot is not None and contract.ShotFolder(shot).info_path.is_file()
     except OSError:
         return False

@@ -376,3 +376,22 @@ def test_an_appended_scene_keeps_its_shot(addon, project, tmp_path, is_saved):
     blend(other)
     assert addon("shot.selection").shot_folder(scene) == project / "people.splannequin"
     assert scene.splannequin.clip == "//../project/people.mp4"
+
+
+def test_bakes_of_a_shot_with_braces_in_its_name_follow_the_project(addon, project, tmp_path):
+    shot = (project / "people.splannequin").rename(project / "{a} {{b}}.splannequin")
+    scene = bpy.context.scene
+    scene.splannequin.shot_path = str(shot)
+    blend(project)
+    addon("bake.rendering").choose_output(scene, shot, "freeze")
+
+    def image() -> Path:
+        return Path(os.path.normpath(bpy.path.abspath(bpy.context.scene.render.frame_path(frame=6))))
+
+    assert image() == shot / "bake" / "freeze" / "000006.png"
+    (tmp_path / "elsewhere").mkdir()
+    blend(tmp_path / "elsewhere")
+    assert image() == shot / "bake" / "freeze" / "000006.png"
+    located = shot.rename(project / "{c}.splannequin")
+    addon("shot.places").locate(bpy.context.scene, located)
+    assert image() == located / "bake" / "freeze" / "000006.png"
