@@ -70,6 +70,20 @@ def named(things: bpy.types.bpy_prop_collection[T], name: str) -> T | None:
     return found
 
 
+def holds(objects: bpy.types.bpy_prop_collection[bpy.types.Object], item: bpy.types.Object) -> bool:
+    """True if a collection has this object. Another one of its name may be linked from another file."""
+    found = named(objects, item.name)
+    return found == item or (found is not None and any(each == item for each in objects))
+
+
+def fully_named(objects: bpy.types.bpy_prop_collection[bpy.types.Object], name: str) -> bpy.types.Object | None:
+    """The object with this `name_full`, which names the file of a linked one, or None."""
+    found = named(objects, name)
+    if found is not None and found.name_full == name:
+        return found
+    return next((each for each in objects if each.name_full == name), None)
+
+
 def value_of(socket: bpy.types.NodeSocket) -> Any:
     """The value of a socket without a link. Not every type of socket has a value."""
     kind: Any = socket

@@ -329,6 +329,11 @@ def literal(path: str) -> str:
     return path.replace("{", "{{").replace("}", "}}") if HAS_PATH_TEMPLATES else path
 
 
+def unescaped(path: str) -> str:
+    """The path that `literal` made an output path of."""
+    return path.replace("{{", "{").replace("}}", "}") if HAS_PATH_TEMPLATES else path
+
+
 def declare_depth_write(info: gpu.types.GPUShaderCreateInfo) -> None:
     """Declares that a shader writes depth (4.4 on)."""
     if hasattr(info, "depth_write"):  # OpenGL, the earlier default, needs no declaration

@@ -37,6 +37,8 @@ def _curves(animation: bpy.types.AnimData | bpy.types.NlaStrip) -> list[Any]:
     """Collections of F-curves of an action: one per strip (4.4 on), or the action's only one."""
     action: Any = animation.action  # the stubs know strips of one version and curves of another
     if hasattr(action, "layers") and action.layers:
+        if animation.action_slot is None:  # the action animates other data-blocks only
+            return []
         bags = [strip.channelbag(animation.action_slot) for layer in action.layers for strip in layer.strips]
         return [bag.fcurves for bag in bags if bag is not None]
     return [action.fcurves] if hasattr(action, "fcurves") else []

@@ -61,7 +61,7 @@ def difference(scene: bpy.types.Scene, take: Path, frames: Sequence[int], camera
         scene: the scene. Its current frame is restored.
         take: folder of the take.
         frames: frames to compare. Frames that the take's camera lacks are skipped.
-        camera: name of a camera of the scene; empty: the active camera, as markers switch it.
+        camera: `name_full` of a camera of the scene; empty: the active camera, as markers switch it.
 
     Raises:
         contract.JobError: the camera of the take is unknown.
@@ -98,7 +98,7 @@ def matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int]) -
     some = [frames[0], frames[len(frames) // 2], frames[-1]]
     first = scene_objects.part(scene, take.parent.parent, "camera")
     every = sorted((o for o in scene.objects if o.type == "CAMERA"), key=lambda o: o != first)
-    return next((camera for camera in every if not difference(scene, take, some, camera.name)), None)
+    return next((camera for camera in every if not difference(scene, take, some, camera.name_full)), None)
 
 
 def use_matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int]) -> list[str]:

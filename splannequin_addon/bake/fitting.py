@@ -56,7 +56,7 @@ def _blend() -> bpy.types.Texture:
 
 def _ramp() -> bpy.types.Image:
     """An image that rises from 0 at the left edge of the frame to 1 at the right."""
-    image = next((i for i in bpy.data.images if i.get(TAG) and i.name.startswith(RAMP)), None)
+    image = next((i for i in bpy.data.images if i.get(TAG) and not i.library and i.name.startswith(RAMP)), None)
     if image is not None:
         return image
     image = bpy.data.images.new(RAMP, _STEPS, _ROWS, alpha=False, float_buffer=True, is_data=True)

@@ -66,7 +66,7 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
     end = compat.output_socket(tree)
     readers = upstream(end.node if end is not None else None)
     readers = [n for n in readers if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
-    nodes = [n for n in tree.nodes if n in readers and _picture(n).is_linked]
+    nodes = [n for n in tree.nodes if n in readers and any(s.is_linked for s in _pictures(n))]
     found = [n for n in nodes if same_footage.shows(_shown(n), footage)]
     if where == "PLATE" and not found:  # shown under another name: take the active node, or the only one
         found = [n for n in nodes if n == tree.nodes.active] or (nodes if len(nodes) == 1 else [])
@@ -78,7 +78,7 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
                 contract.ExitCode.BAKE,
             )
         return None
-    socket = _picture(found[0])
+    socket = _pictures(found[0])[0]
     while True:
         links = links_of(socket)
         behind = links[0].to_node if len(links) == 1 else None
@@ -96,9 +96,9 @@ def links_of(socket: bpy.types.NodeSocket) -> list[bpy.types.NodeLink]:
     return list(present(socket.links))
 
 
-def _picture(node: bpy.types.Node) -> bpy.types.NodeSocket:
-    """The image output of an Image or Movie Clip node."""
-    return next(s for s in node.outputs if s.enabled and s.type == "RGBA")
+def _pictures(node: bpy.types.Node) -> list[bpy.types.NodeSocket]:
+    """The image output of an Image or Movie Clip node in a list, which is empty for a file with data passes only."""
+    return [s for s in node.outputs if s.enabled and s.type == "RGBA"][:1]
 
 
 def upstream(end: bpy.types.Node | None) -> list[bpy.types.Node]:

@@ -21,7 +21,7 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..scene import paths, scene_setup
-from ..scene.ownership import BAKES, DIGITS
+from ..scene.ownership import BAKES, DIGITS, rendered_of
 from . import render_settings
 
 COMPOSITED = "composited"
@@ -49,11 +49,21 @@ def default_output(shot: Path, take: str) -> Path:
 
 
 def choose_output(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
-    """Sets the scene's output path if it still has Blender's default. Returns the changes as sentences."""
-    if scene.render.filepath not in _DEFAULT_OUTPUTS:
+    """Sets the scene's output path if it has Blender's default or that of another take. Returns the changes as
+    sentences."""
+    now, wanted = scene.render.filepath, output_path(default_output(shot, take))
+    is_free = now in _DEFAULT_OUTPUTS or _is_default_of_a_take(now)
+    if not is_free or paths.absolute(now) == paths.absolute(wanted):
         return []
-    scene.render.filepath = output_path(default_output(shot, take))
+    scene.render.filepath = wanted
     return ["The output path is now in the shot's folder."]
+
+
+def _is_default_of_a_take(path: str) -> bool:
+    """True if an output path is the default of an existing take, whose images must not be overwritten by others'."""
+    folder = Path(compat.unescaped(paths.absolute(path))).parent
+    shot = rendered_of(folder / DIGITS) if Path(path).name == DIGITS else None
+    return shot is not None and contract.TakeFolder(contract.ShotFolder(shot).take(folder.name)).facts.is_file()
 
 
 def output_path(folder: Path) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
-from ..access import library_of, settings_of
+from ..access import holds, library_of, settings_of
 from ..shot import scene_objects, selection
 
 # Shot folder that is being scrubbed, or None.
@@ -39,7 +39,7 @@ def _hide(scene: bpy.types.Scene, shot: Path) -> None:
     entry, cloud = scene_objects.of(scene, shot), scene_objects.part(scene, shot, "points")
     if entry is None or cloud is None:
         return
-    shown = [layer for layer in scene.view_layers if cloud.name in layer.objects]
+    shown = [layer for layer in scene.view_layers if holds(layer.objects, cloud)]
     shown = [layer for layer in shown if not cloud.hide_get(view_layer=layer)]
     for layer in shown:
         cloud.hide_set(True, view_layer=layer)
@@ -56,7 +56,7 @@ def _restore(*_: object) -> None:
             if cloud is None or not entry.points_hidden_in:
                 continue
             for layer in scene.view_layers:
-                if layer.name in _names(entry.points_hidden_in) and cloud.name in layer.objects:
+                if layer.name in _names(entry.points_hidden_in) and holds(layer.objects, cloud):
                     cloud.hide_set(False, view_layer=layer)
             entry.points_hidden_in = ""
 

@@ -5,6 +5,7 @@ The artist's world stays in the file unchanged, and returns when the light is re
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from mathutils import Matrix
 from ...torch_backend import contract
 from .. import compat
 from ..access import present, settings_of
-from ..scene import paths
+from ..scene import paths, sequences
 from ..scene.ownership import TAG
 from ..shot import scene_objects
 
@@ -87,10 +88,9 @@ def _restore_world(scene: bpy.types.Scene) -> None:
 
 def _image(path: Path) -> bpy.types.Image:
     """A panorama as an image data-block, reused by path."""
-    for known in bpy.data.images:
-        if known.get(TAG) and paths.same(paths.absolute(known.filepath), str(path)):
-            # Without a reload: a panorama's name identifies its content.
-            return known
+    known = sequences.find(os.path.abspath(path))
+    if known is not None:  # without a reload: a panorama's name identifies its content
+        return known
     compat.colour_space("linear")  # fails before anything is created if the configuration lacks the space
     image = bpy.data.images.load(contract.regular_file(path))
     image.name = f"{path.parent.parent.name} light"

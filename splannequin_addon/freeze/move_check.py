@@ -62,7 +62,7 @@ def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_tim
     Args:
         scene: the scene with the freeze's range and settings.
         shot: its shot folder.
-        name: name of the camera object.
+        name: `name_full` of the camera object.
 
     Raises:
         contract.JobError: the camera cannot be read, the run or backend is missing, or the session ended.

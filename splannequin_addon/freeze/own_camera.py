@@ -23,7 +23,7 @@ def sample_path(
 
     Args:
         scene: the scene with the range, render size and pixel aspect of the path.
-        name: name of the camera object.
+        name: `name_full` of the camera object.
         shot: shot folder. The path is in the coordinates of its solve.
         width: width of the frames in pixels; 0: the scene's.
         every: read every n-th frame of the scene, and the last one.
@@ -47,11 +47,11 @@ def sample_path(
 
 
 def name_of(scene: bpy.types.Scene) -> str:
-    """Name of the artist's camera to freeze from; empty for the clip's move."""
+    """`name_full` of the artist's camera to freeze from; empty for the clip's move."""
     camera, folder = settings_of(scene).path_camera, selection.shot_folder(scene)
     if camera is None or folder is None or camera == scene_objects.part(scene, folder, "camera"):
         return ""
-    return str(camera.name)
+    return str(camera.name_full)
 
 
 def shutter_of(scene: bpy.types.Scene) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ...torch_backend import contract
-from ..access import camera_of
+from ..access import camera_of, holds
 from ..scene import sequences
 from ..scene.ownership import TAG
 from ..shot import scene_objects
@@ -35,6 +35,6 @@ def show(scene: bpy.types.Scene, shot: Path, name: str, first: int, last: int) -
     data.show_background_images = True
     points = scene_objects.part(scene, shot, "points")
     for layer in scene.view_layers:
-        if points is not None and points.name in layer.objects:
+        if points is not None and holds(layer.objects, points):
             points.hide_set(True, view_layer=layer)  # they would cover the image
     return [f"The camera shows the frames of take {name}. The points are hidden."]

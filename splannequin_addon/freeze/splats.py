@@ -16,7 +16,7 @@ from mathutils import Matrix
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import named, present
+from ..access import holds, named, present
 from ..process import job_timer
 from ..scene.ownership import TAG
 from ..shot import inventory, placement, scene_objects
@@ -177,7 +177,7 @@ def _keep(scene: bpy.types.Scene, shot: Path, take: str, items: list[bpy.types.O
     for item in items:
         for collection in item.users_collection:
             collection.objects.unlink(item)
-        present(entry.collection).objects.link(item)
+        scene_objects.own_collection(scene, shot).objects.link(item)
         item.parent, item.matrix_parent_inverse = root, Matrix()
         item.matrix_basis = transform @ item.matrix_basis
     kept = entry.splats.add()
@@ -220,7 +220,7 @@ def find(scene: bpy.types.Scene, shot: Path, take: str) -> bpy.types.Object | No
     entry = scene_objects.of(scene, shot)
     kept = next((one for one in entry.splats if one.name == take), None) if entry is not None else None
     item = kept.object if kept is not None else None
-    return item if item is not None and named(scene.objects, item.name) == item else None
+    return item if item is not None and holds(scene.objects, item) else None
 
 
 def remove(scene: bpy.types.Scene, shot: Path, take: str | None = None) -> bool:

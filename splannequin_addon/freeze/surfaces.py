@@ -15,7 +15,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..access import named, present
+from ..access import holds, present
 from ..process import job_timer
 from ..scene.ownership import TAG
 from ..shot import inventory, placement, scene_objects
@@ -144,7 +144,7 @@ def _show(scene: bpy.types.Scene, shot: Path, take: str, meshes: list[bpy.types.
             continue
         mesh.materials.append(_material())
         item = bpy.data.objects.new(mesh.name, mesh)
-        present(entry.collection).objects.link(item)
+        scene_objects.own_collection(scene, shot).objects.link(item)
         item.parent, item.matrix_parent_inverse, item.matrix_basis = root, Matrix(), transform
         # A holdout would also hide objects behind people. But it would cast people's shadows, which the plate already
         # has, and it would not catch any shadows.
@@ -159,7 +159,7 @@ def find(scene: bpy.types.Scene, shot: Path, take: str) -> list[bpy.types.Object
     """The objects of a take's surface that the scene still has."""
     entry = scene_objects.of(scene, shot)
     items = [one.object for one in entry.surfaces if one.name == take] if entry is not None else []
-    return [item for item in items if item is not None and named(scene.objects, item.name) == item]
+    return [item for item in items if item is not None and holds(scene.objects, item)]
 
 
 def remove(scene: bpy.types.Scene, shot: Path, take: str | None = None) -> bool:

@@ -68,7 +68,8 @@ def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
 
 def keyed_instants(scene: bpy.types.Scene) -> dict[str, float]:
     """Frame -> t* if t* has keyframes, for every frame of the clip and of the scene's range; otherwise empty."""
-    curve = next((c for c in compat_animation.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
+    curves = (c for c in compat_animation.fcurves(scene) if c.data_path == "splannequin.t_star" and not c.mute)
+    curve = next(curves, None)
     if curve is None or not settings_of(scene).choose_t_star:
         return {}
     folder = selection.shot_folder(scene)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from typing import TYPE_CHECKING, Any
 
@@ -150,13 +151,14 @@ def note(scene: bpy.types.Scene, text: str) -> list[str]:
 
 def _neutral(view: Any) -> str:
     """Name of the view that leaves colours unchanged. Raises JobError if the selected display has none."""
-    was = view.view_transform
+    was, look = view.view_transform, view.look
     for name in (was, *NEUTRAL_VIEWS):
         try:
             view.view_transform = name
         except TypeError:  # the enumeration lacks the value; Blender offers no list of its values
             continue
         view.view_transform = was
+        view.look = look  # Blender resets a look that a view lacks
         if name in NEUTRAL_VIEWS:
             return name
     raise contract.JobError(
@@ -200,7 +202,9 @@ def restore(scene: bpy.types.Scene) -> bool:
         target = _owner(scene, owner)
         for name, value in values.items():
             if name not in touched.get(owner, ()):
-                setattr(target, name, value)
+                # An enumeration may lack the value now: a look of another view, or a view of another configuration.
+                with contextlib.suppress(TypeError):
+                    setattr(target, name, value)
     for key in (_BEFORE, _OURS):
         if key in scene:
             del scene[key]

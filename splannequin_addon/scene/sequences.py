@@ -55,6 +55,15 @@ def shown_size(image: bpy.types.Image, first: int, last: int, shift: int = 0) ->
         bpy.data.node_groups.remove(reader)
 
 
+def find(path: str) -> bpy.types.Image | None:
+    """Our image data-block of the file with this absolute path, or None.
+
+    Linked images do not count: their relative paths start at their own file, and they are read-only.
+    """
+    ours = (image for image in bpy.data.images if image.get(TAG) and not image.library)
+    return next((image for image in ours if paths.same(paths.absolute(image.filepath), path)), None)
+
+
 def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = False) -> bpy.types.Image:
     """An image sequence or a video as a data-block, reused by path.
 
@@ -62,14 +71,14 @@ def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = Fals
     configuration lacks the encoding, and RuntimeError if Blender cannot read the file.
     """
     wanted = os.path.abspath(path)
-    for image in bpy.data.images:
-        if image.get(TAG) and paths.same(paths.absolute(image.filepath), wanted):
-            compat.set_image_colour(image, encoding)  # another import may have used another encoding
-            _make_opaque(image, opaque)
-            if wanted not in _prefetched:
-                image.reload()
-            _prefetched.discard(wanted)
-            return image
+    known = find(wanted)
+    if known is not None:
+        compat.set_image_colour(known, encoding)  # another import may have used another encoding
+        _make_opaque(known, opaque)
+        if wanted not in _prefetched:
+            known.reload()
+        _prefetched.discard(wanted)
+        return known
     compat.colour_space(encoding)  # fails before anything is created if the configuration lacks the space
     image = bpy.data.images.load(contract.regular_file(wanted, None))
     image.name = name
@@ -91,12 +100,12 @@ def _make_opaque(image: bpy.types.Image, opaque: bool) -> None:
 def load_numbers(path: Path, name: str) -> bpy.types.Image:
     """An image of numbers instead of colours as a data-block, reused by path."""
     wanted = os.path.abspath(path)
-    for known in bpy.data.images:
-        if known.get(TAG) and paths.same(paths.absolute(known.filepath), wanted):
-            if wanted not in _prefetched:
-                known.reload()
-            _prefetched.discard(wanted)
-            return known
+    known = find(wanted)
+    if known is not None:
+        if wanted not in _prefetched:
+            known.reload()
+        _prefetched.discard(wanted)
+        return known
     image = bpy.data.images.load(contract.regular_file(wanted))
     image.name = name
     image[TAG] = True
@@ -108,7 +117,7 @@ def load_numbers(path: Path, name: str) -> bpy.types.Image:
 def relative_images() -> None:
     """Makes the paths of our images relative to the .blend, once it has a path."""
     for image in bpy.data.images:
-        if image.get(TAG) and image.filepath:
+        if image.get(TAG) and image.filepath and not image.library:
             image.filepath = paths.blend_path(Path(bpy.path.abspath(image.filepath)))
 
 

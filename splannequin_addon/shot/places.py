@@ -17,14 +17,15 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
+from .. import compat
 from ..access import library_of, settings_of
 from ..scene import paths
-from ..scene.ownership import BAKES, DIGITS, MATTE_SHOT, TAG
+from ..scene.ownership import MATTE_SHOT, TAG, rendered_of
 from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
 # Settings of a shot that are paths.
-_SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "shot_seen")
+_SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "depth", "shot_seen")
 # Property of the scene's render settings: the output path, which may be ours.
 _OUTPUT = "filepath"
 # Paths of `_holders` from before the save, to be restored after it.
@@ -62,12 +63,17 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
         entry.name, entry.folder = scene_objects.name_of(folder), paths.blend_path(folder)
     for image in bpy.data.images:
         path = Path(paths.absolute(image.filepath))
-        if before is not None and image.get(TAG) and before in path.parents and not path.exists():
+        ours = image.get(TAG) and not image.library
+        if before is not None and ours and before in path.parents and not path.exists():
             image.filepath = paths.blend_path(folder / path.relative_to(before))
     for owner, name in _outside():
         path = Path(paths.absolute(_get(owner, name)))
-        if before is not None and before in (path, _rendered_of(path)) and not before.exists():
-            _set(owner, name, paths.blend_path(folder / path.relative_to(before)))
+        if before is None or before.exists():
+            continue
+        if path == before:
+            _set(owner, name, paths.blend_path(folder))
+        elif before == rendered_of(Path(compat.unescaped(str(path)))):
+            _set(owner, name, compat.literal(paths.blend_path(folder / path.relative_to(path.parents[2]))))
     props.shot_path = props.shot_seen = paths.blend_path(folder)
     source = source_of(state)
     if source and not (props.clip and _exists(Path(paths.absolute(props.clip)))):
@@ -82,11 +88,16 @@ def _exists(path: Path) -> bool:
 def _holders() -> Iterator[tuple[Any, str]]:
     """(owner, property) of every path of ours in the file."""
     for scene in [s for s in bpy.data.scenes if not library_of(s)]:
-        props = settings_of(scene)
-        for one in [props, *props.shots]:
-            yield from ((one, name) for name in _SETTINGS)
-        yield from ((entry, "folder") for entry in props.made)
+        yield from _holders_in(scene)
     yield from _outside()
+
+
+def _holders_in(scene: bpy.types.Scene) -> Iterator[tuple[Any, str]]:
+    """`_holders` in the settings of a scene."""
+    props = settings_of(scene)
+    for one in [props, *props.shots]:
+        yield from ((one, name) for name in _SETTINGS)
+    yield from ((entry, "folder") for entry in props.made)
 
 
 def _outside() -> Iterator[tuple[Any, str]]:
@@ -106,12 +117,6 @@ def _set(owner: bpy.types.bpy_struct, name: str, path: str) -> None:
         owner[name] = path
     else:
         setattr(owner, name, path)
-
-
-def _rendered_of(path: Path) -> Path | None:
-    """The shot of an output path of ours; None for the artist's path."""
-    ours = path.name == DIGITS and len(path.parents) > 2 and path.parents[1].name == BAKES
-    return path.parents[2] if ours else None
 
 
 def _relative(path: str, base: str) -> str:
@@ -167,6 +172,23 @@ def _after_load(*_: object) -> None:
             _set(owner, name, paths.blend_path(found))
 
 
+@persistent
+def _after_import(context: Any, *_: object) -> None:
+    """Handler: relative paths of appended data started at the file that they come from."""
+    for item in context.import_items:
+        block = item.id
+        if item.append_action not in ("MAKE_LOCAL", "COPY_LOCAL") or item.source_library is None:
+            continue
+        holders: list[tuple[Any, str]] = list(_holders_in(block)) if isinstance(block, bpy.types.Scene) else []
+        if isinstance(block, bpy.types.Image) and isinstance(block.get(MATTE_SHOT), str):
+            holders.append((block, MATTE_SHOT))
+        origin = os.path.dirname(bpy.path.abspath(item.source_library.filepath))
+        for owner, name in holders:
+            path = _get(owner, name)
+            if path.startswith("//"):
+                _set(owner, name, paths.blend_path(Path(bpy.path.abspath(path, start=origin))))
+
+
 def _read_backslashes() -> None:
     """Converts relative paths of a file saved on Windows to slashes on other systems, as Blender does with its
     paths."""
@@ -193,11 +215,11 @@ def _slashed(path: str) -> str:
 def _known(path: Path, name: str) -> bool:
     """True if the file or folder of the setting `name` exists. For a clip, its shot is sufficient."""
     try:
-        if name in ("clip", "cameras_path", "st_map", "lut", "ignore_path", "people_path"):
+        if name in ("clip", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "depth"):
             return _exists(path) or (
                 name == "clip" and contract.ShotFolder(selection.folder_of_clip(path)).info_path.is_file()
             )
-        shot = _rendered_of(path) if name == _OUTPUT else path
+        shot = rendered_of(Path(compat.unescaped(str(path)))) if name == _OUTPUT else path
         return shot is not None and contract.ShotFolder(shot).info_path.is_file()
     except OSError:
         return False
@@ -208,6 +230,7 @@ _HANDLERS = (
     ("save_post", _after_save),
     ("save_post_fail", _after_save),
     ("load_post", _after_load),
+    *((("blend_import_post", _after_import),) if hasattr(bpy.app.handlers, "blend_import_post") else ()),  # 4.3 on
 )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 
 from ...torch_backend import contract
-from ..access import named, settings_of
+from ..access import holds, named, settings_of
 from ..properties import BoolProperty, CollectionProperty, FloatProperty, Items, PointerProperty, StringProperty
 from ..scene import paths, session
 
@@ -78,14 +78,23 @@ def name_of(shot: Path) -> str:
 def of(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made | None:
     """The entry of a shot's objects, or None."""
     # Panels call this while drawing, when Blender forbids writes.
-    for entry in settings_of(scene).made:
-        if entry.name != name_of(shot):
-            continue
-        folder = os.path.abspath(paths.absolute(entry.folder))
-        # A different path is another shot of the same name, unless the shot was moved here since.
-        if paths.same(folder, os.path.abspath(shot)) or not os.path.isdir(folder):
+    alike = [entry for entry in settings_of(scene).made if entry.name == name_of(shot)]
+    folders = [os.path.abspath(paths.absolute(entry.folder)) for entry in alike]
+    for entry, folder in zip(alike, folders, strict=True):
+        if paths.same(folder, os.path.abspath(shot)):
+            return entry
+    # A different path is another shot of the same name, unless the shot was moved here since.
+    for entry, folder in zip(alike, folders, strict=True):
+        if not os.path.isdir(folder) and not _is_of_another(scene, folder):
             return entry
     return None
+
+
+def _is_of_another(scene: bpy.types.Scene, folder: str) -> bool:
+    """True if a missing folder is that of a shot in the scene's list that is not selected. Its disk may be away."""
+    props = settings_of(scene)
+    others = [one for index, one in enumerate(props.shots) if index != props.loaded_shot]
+    return any(paths.same(paths.absolute(one.shot_seen), folder) for one in others)
 
 
 def new(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made:
@@ -93,6 +102,15 @@ def new(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made:
     entry = of(scene, shot) or settings_of(scene).made.add()
     entry.name, entry.folder = name_of(shot), paths.blend_path(shot)
     return entry
+
+
+def own_collection(scene: bpy.types.Scene, shot: Path) -> bpy.types.Collection:
+    """The collection of the shot's objects, created if the scene no longer has it."""
+    entry = new(scene, shot)
+    if entry.collection is None or entry.collection not in scene.collection.children_recursive:
+        entry.collection = bpy.data.collections.new(f"Splannequin {name_of(shot)}")
+        scene.collection.children.link(entry.collection)
+    return entry.collection
 
 
 def drop(scene: bpy.types.Scene, shot: Path) -> None:
@@ -106,7 +124,7 @@ def part(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | No
     """The shot's object called `name` (one of `PARTS`, or "plate"); None if the scene no longer has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
-    return item if item is not None and named(scene.objects, item.name) == item else None
+    return item if item is not None and holds(scene.objects, item) else None
 
 
 def keep_camera(scene: bpy.types.Scene) -> None:
@@ -122,7 +140,7 @@ def restore_camera(scene: bpy.types.Scene) -> None:
     props = settings_of(scene)
     if scene.camera is None:
         candidates = [entry.camera for entry in props.made] + [props.camera_before]
-        scene.camera = next((c for c in candidates if c is not None and named(scene.objects, c.name) == c), None)
+        scene.camera = next((c for c in candidates if c is not None and holds(scene.objects, c)), None)
     if not len(props.made):
         props.camera_before = None
 

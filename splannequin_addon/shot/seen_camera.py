@@ -13,7 +13,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..access import camera_of, named, present
+from ..access import camera_of, fully_named, holds, present
 from ..scene import axes, session
 from . import scene_objects
 
@@ -69,7 +69,7 @@ def evaluated(
 
     Args:
         scene: the scene; None if it no longer exists.
-        name: name of the camera object; empty: the active camera, as markers switch it.
+        name: `name_full` of the camera object; empty: the active camera, as markers switch it.
         number: frame number.
         size: width and height of the image in pixels, with the scene's pixel aspect.
         hint: hint of the error if it is not a perspective camera of the scene.
@@ -83,7 +83,7 @@ def evaluated(
     """
     if scene is not None:
         scene.frame_set(number)
-    camera = None if scene is None else named(scene.objects, name) if name else scene.camera
+    camera = None if scene is None else fully_named(scene.objects, name) if name else scene.camera
     if scene is None or camera is None or camera.type != "CAMERA" or camera_of(camera).type != "PERSP":
         name = name or (camera.name if camera is not None else "The scene's camera")
         raise contract.JobError(
@@ -120,7 +120,7 @@ def frame_kept(scene_uid: int) -> Generator[None]:
 
 def _layer(scene: bpy.types.Scene, camera: bpy.types.Object) -> bpy.types.ViewLayer:
     """A view layer of the scene with a camera: the context's if possible, else the first."""
-    layers = [layer for layer in scene.view_layers if named(layer.objects, camera.name) == camera]
+    layers = [layer for layer in scene.view_layers if holds(layer.objects, camera)]
     shown = bpy.context.view_layer
     return next((layer for layer in layers if layer == shown), (layers or list(scene.view_layers))[0])
 

@@ -127,10 +127,7 @@ def _root(scene: bpy.types.Scene, shot: Path, pose: np.ndarray, size: float) -> 
         size: display size of a new root.
     """
     name, entry = scene_objects.name_of(shot), scene_objects.new(scene, shot)
-    collection = entry.collection
-    if collection is None or collection not in scene.collection.children_recursive:
-        collection = entry.collection = bpy.data.collections.new(f"Splannequin {name}")
-        scene.collection.children.link(collection)
+    collection = scene_objects.own_collection(scene, shot)
     root = scene_objects.part(scene, shot, "root")
     if root is None:
         root = entry.root = bpy.data.objects.new(f"{name} root", None)

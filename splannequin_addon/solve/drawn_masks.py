@@ -99,7 +99,7 @@ def _render_one(mask_uid: int, name: str, size: tuple[int, int], file: Path, fra
         raise contract.JobError(f"The mask {name} no longer exists.", "Choose another mask.", contract.ExitCode.USAGE)
     with _stage(mask, size) as scene:
         scene.frame_set(frame)
-        scene.render.filepath = str(file)
+        scene.render.filepath = compat.literal(str(file))
         bpy.ops.render.render(scene=scene.name, write_still=True)
     if not file.is_file():
         raise contract.JobError(

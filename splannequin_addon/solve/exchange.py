@@ -81,7 +81,7 @@ def _imported(shot: Path | None) -> Path:
 
 
 def _scene_camera(scene: bpy.types.Scene) -> str:
-    """Name of the selected camera of the scene. Raises JobError if it is missing or shows only the plate."""
+    """`name_full` of the selected camera of the scene. Raises JobError if it is missing or shows only the plate."""
     camera = settings_of(scene).scene_camera
     if camera is None or scene_objects.is_plate(camera):
         raise contract.JobError(
@@ -89,7 +89,7 @@ def _scene_camera(scene: bpy.types.Scene) -> str:
             "Choose an animated camera, or set Cameras From to Solve.",
             contract.ExitCode.USAGE,
         )
-    return str(camera.name)
+    return str(camera.name_full)
 
 
 def has_file_for_blender(requested: contract.SolveParams) -> bool:

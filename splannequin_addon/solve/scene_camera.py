@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
-from ..access import named
+from ..access import fully_named
 from ..scene import scene_setup, session
 from ..shot import seen_camera
 from . import camera_samples
@@ -31,7 +31,7 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
 
     Args:
         scene: the scene, for its pixel aspect.
-        name: name of the camera object.
+        name: `name_full` of the camera object.
         shot: shot folder.
 
     Raises:
@@ -54,7 +54,7 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
             contract.ExitCode.USAGE,
         )
     found = session.scene_of(uid)
-    camera = named(found.objects, name) if found is not None else None
+    camera = fully_named(found.objects, name) if found is not None else None
     covered = camera_samples.without_ends(samples, camera_samples.keyed(camera) if camera is not None else None)
     return camera_samples.write(shot, camera_samples.transforms(covered, size, is_numbered_as_shot=True))
 

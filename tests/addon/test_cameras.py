@@ -444,3 +444,55 @@ def test_points_are_drawn_with_their_colours(addon, scene, shot):
     assert cloud.display_type == "BOUNDS"
     cloud.name = "renamed"
     assert cameras.find(scene, shot, "MESH") == cloud
+
+
+def test_a_camera_linked_under_the_same_name_is_not_read_instead(addon, moving, shot, tmp_path):
+    """Nearly every file has an object `Camera`, and Blender lists a linked one first if its collection is first."""
+    collection = bpy.data.collections.new("Theirs")
+    moving.collection.children.link(collection)
+    theirs = bpy.data.objects.new("Filmed", bpy.data.cameras.new("Filmed"))
+    collection.objects.link(theirs)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"), copy=True)
+    bpy.data.batch_remove([theirs, collection])
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, here):
+        here.collections = ["Theirs"]
+    moving.collection.children.link(bpy.data.collections["Theirs"])
+    mine, own = moving.objects["Camera"], bpy.data.collections.new("Mine")
+    moving.collection.children.link(own)
+    for each in list(mine.users_collection):
+        each.objects.unlink(mine)
+    own.objects.link(mine)
+    mine.name = "Filmed"
+    assert mine.name == "Filmed" and moving.objects["Filmed"] != mine, "this Blender lists the linked one first"
+    moving.splannequin.shot_path, moving.splannequin.path_camera = str(shot), mine
+    name = addon("freeze.own_camera").name_of(moving)
+    path = run_out(addon("freeze.own_camera").sample_path(moving, name, shot, 64))
+    assert len({tuple(frame.viewmat) for frame in path.frames}) == 5, "the artist's camera moves"
+    theirs = next(item for item in moving.objects if item.name == "Filmed" and item != mine)
+    moving.splannequin.path_camera = theirs
+    name = addon("freeze.own_camera").name_of(moving)
+    path = run_out(addon("freeze.own_camera").sample_path(moving, name, shot, 64))
+    assert len({tuple(frame.viewmat) for frame in path.frames}) == 1, "the linked one does not"
+
+
+def test_muted_keyframes_of_t_star_are_not_followed(addon, scene, shot):
+    props = scene.splannequin
+    props.shot_path, props.choose_t_star, props.t_star = str(shot), True, 5
+    props.keyframe_insert("t_star", frame=5)
+    (curve,) = addon("compat_animation").fcurves(scene)
+    assert addon("freeze.takes").keyed_instants(scene)
+    curve.mute = True
+    assert addon("freeze.takes").keyed_instants(scene) == {}
+
+
+def test_an_action_without_a_slot_for_the_scene_has_no_curves(addon, scene):
+    action = bpy.data.actions.new("of others")
+    if not hasattr(action, "slots"):
+        pytest.skip("since 4.4")
+    scene.animation_data_create().action = action
+    other = action.slots.new("OBJECT", "other")
+    strip = action.layers.new("Layer").strips.new(type="KEYFRAME")
+    strip.channelbag(other, ensure=True).fcurves.new("location", index=0)
+    assert scene.animation_data.action_slot is None
+    assert list(addon("compat_animation").fcurves(scene)) == []
+    addon("compat_animation").remove_fcurves(scene, "splannequin.t_star")

@@ -1,5 +1,6 @@
 """The freeze in the scene's compositor: artists' nodes stay unchanged, and the pixels equal the backend's."""
 
+import struct
 from pathlib import Path
 
 import bpy
@@ -642,3 +643,38 @@ def test_a_half_covered_edge_of_cg_is_blended_by_its_coverage(addon, scene, shot
 def make_depth(frame: int) -> np.ndarray:
     y, x = np.mgrid[0:12, 0:16]
     return frame + x / 16.0 + y
+
+
+def depth_only_exr(path: Path) -> None:
+    """An EXR whose only channel is a depth pass, as renderers write utility passes: 16 x 12, uncompressed."""
+    width, height = 16, 12
+
+    def attribute(name: str, kind: str, data: bytes) -> bytes:
+        return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(data)) + data
+
+    channels = b"View.Depth.Z\0" + struct.pack("<iiii", 2, 0, 1, 1) + b"\0"
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    head = b"\x76\x2f\x31\x01" + struct.pack("<i", 2)
+    head += attribute("channels", "chlist", channels) + attribute("compression", "compression", b"\0")
+    head += attribute("dataWindow", "box2i", window) + attribute("displayWindow", "box2i", window)
+    head += attribute("lineOrder", "lineOrder", b"\0") + attribute("pixelAspectRatio", "float", struct.pack("<f", 1))
+    head += attribute("screenWindowCenter", "v2f", bytes(8)) + attribute("screenWindowWidth", "float", bytes(4))
+    head += b"\0"
+    first = len(head) + 8 * height
+    rows = [struct.pack("<ii", y, 4 * width) + np.full(width, 2.0, "<f4").tobytes() for y in range(height)]
+    offsets = b"".join(struct.pack("<q", first + y * len(rows[0])) for y in range(height))
+    path.write_bytes(head + offsets + b"".join(rows))
+
+
+@pytest.mark.parametrize("where", ["AUTO", "PLATE"])
+def test_an_image_node_without_colours_is_not_the_plate(addon, scene, shot, graded, tmp_path, where):
+    tree, plate = graded(shot / "frames" / "000005.png")
+    depth_only_exr(tmp_path / "depth.exr")
+    depth = tree.nodes.new("CompositorNodeImage")
+    depth.image = bpy.data.images.load(str(tmp_path / "depth.exr"))
+    assert [s.name for s in depth.outputs if s.enabled] == ["Depth"]
+    grade = plate.outputs["Image"].links[0].to_node
+    tree.links.new(depth.outputs["Depth"], grade.inputs["Exposure"])
+    scene.splannequin.insert_at, scene.splannequin.shot_path = where, str(shot)
+    assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
+    assert [link.to_node for link in plate.outputs["Image"].links] == [addon("bake.freeze_group").group_node(tree)]

@@ -235,3 +235,10 @@ def test_what_the_import_finds_to_be_burnt_in_is_ignored_unless_the_artist_says_
             props.people_from = "FOUND"
     finally:
         props.property_unset("ignore_from")
+
+
+def test_a_drawn_mask_is_rendered_into_a_folder_with_braces_in_its_name(addon, shot, drawn):
+    shot = shot.rename(shot.with_name("{show} {{x}}.splannequin"))
+    folder = addon("solve.drawn_masks").render(drawn, shot, "people")
+    assert folder == shot / "masks" / "people"
+    assert sorted(p.name for p in folder.iterdir()) == ["000005.png", "000006.png", "000007.png"]

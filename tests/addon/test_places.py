@@ -59,7 +59,7 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     )
 
 
-@pytest.mark.parametrize("name", ["ignore_path", "people_path", "st_map", "cameras_path"])
+@pytest.mark.parametrize("name", ["ignore_path", "people_path", "st_map", "cameras_path", "depth"])
 def test_solve_inputs_are_found_in_a_moved_project(addon, project, name):
     (project / "given.exr").touch()
     setattr(bpy.context.scene.splannequin, name, str(project / "given.exr"))
@@ -329,3 +329,69 @@ def test_a_keyed_camera_of_a_moved_shot_is_found(addon, shot):
     take_file = shot / "takes" / "freeze" / "take.json"
     take_file.write_text(json.dumps(json.loads(take_file.read_text()) | {"camera_path": "/nowhere/paths/freeze.json"}))
     assert addon("freeze.takes").take_params(shot, "freeze").camera_path == str(shot / "paths" / "freeze.json")
+
+
+def test_images_linked_from_the_same_shot_of_another_project_are_not_used(addon, project, tmp_path):
+    """Two projects made alike: what is linked from the one has the same relative paths as the other's images."""
+    other = Path(shutil.copytree(project, tmp_path / "other"))
+    blend(project)
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    blend(other)
+    with bpy.data.libraries.load(str(project / "work.blend"), link=True) as (there, here):
+        here.images = there.images
+    linked = {i.name: i.filepath for i in bpy.data.images if i.library}
+    bpy.context.scene.splannequin.shot_path = str(other / "people.splannequin")
+    bpy.ops.splannequin.load_camera()
+    bpy.ops.splannequin.insert_freeze()
+    image = bpy.context.scene.camera.data.background_images[0].image
+    assert image.library is None and plate_file() == other / "people.splannequin" / "frames" / "000005.png"
+    assert addon("bake.freeze_group").shown(bpy.context.scene)[0] == other / "people.splannequin" / "takes" / "freeze"
+    tree = addon("compat").compositor_tree(bpy.context.scene)
+    group = addon("bake.freeze_group").group_node(tree).node_tree
+    assert not [n for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image.library]
+    addon("scene.sequences").relative_images()
+    assert {i.name: i.filepath for i in bpy.data.images if i.library} == linked
+
+
+@pytest.mark.skipif(not hasattr(bpy.app.handlers, "blend_import_post"), reason="since 4.3")
+@pytest.mark.parametrize("is_saved", [True, False])
+def test_an_appended_scene_keeps_its_shot(addon, project, tmp_path, is_saved):
+    """The other folder has a shot of the same name, as a second project made by the command line has."""
+    other, scene = Path(shutil.copytree(project, tmp_path / "other")), bpy.context.scene
+    scene.name = "Layout"
+    painted_on(project / "people.splannequin")
+    blend(project)
+    assert scene.splannequin.clip == "//people.mp4"
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    if is_saved:
+        blend(other)
+    with bpy.data.libraries.load(str(project / "work.blend"), link=False) as (_, here):
+        here.scenes, here.images = ["Layout"], ["Motion"]
+    scene = bpy.data.scenes["Layout"]
+    assert scene.library is None
+    assert addon("shot.selection").shot_folder(scene) == project / "people.splannequin"
+    assert addon("scene.paths").absolute(scene.splannequin.clip) == str(project / "people.mp4")
+    assert addon("solve.cameras").find(scene, project / "people.splannequin", "CAMERA") is not None
+    assert addon("solve.mattes").find_image(project / "people.splannequin", 6) is not None
+    blend(other)
+    assert addon("shot.selection").shot_folder(scene) == project / "people.splannequin"
+    assert scene.splannequin.clip == "//../project/people.mp4"
+
+
+def test_bakes_of_a_shot_with_braces_in_its_name_follow_the_project(addon, project, tmp_path):
+    shot = (project / "people.splannequin").rename(project / "{a} {{b}}.splannequin")
+    scene = bpy.context.scene
+    scene.splannequin.shot_path = str(shot)
+    blend(project)
+    addon("bake.rendering").choose_output(scene, shot, "freeze")
+
+    def image() -> Path:
+        return Path(os.path.normpath(bpy.path.abspath(bpy.context.scene.render.frame_path(frame=6))))
+
+    assert image() == shot / "bake" / "freeze" / "000006.png"
+    (tmp_path / "elsewhere").mkdir()
+    blend(tmp_path / "elsewhere")
+    assert image() == shot / "bake" / "freeze" / "000006.png"
+    located = shot.rename(project / "{c}.splannequin")
+    addon("shot.places").locate(bpy.context.scene, located)
+    assert image() == located / "bake" / "freeze" / "000006.png"

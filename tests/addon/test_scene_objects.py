@@ -179,3 +179,24 @@ def test_another_shots_camera_takes_the_place_of_a_removed_one(addon, built, sho
     assert built.camera == cameras.find(built, second_shot, "CAMERA")
     cameras.remove(built, second_shot)
     assert built.camera == first_camera
+
+
+def test_objects_linked_under_our_names_do_not_hide_ours(addon, built, shot, tmp_path):
+    """Shots made alike are named alike, so that objects linked from another shot's file have the names of ours."""
+    scene_objects, collection = addon("shot.scene_objects"), built.splannequin.made[0].collection.name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    scene = bpy.context.scene
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, here):
+        here.collections = [collection]
+    scene.collection.children.link(bpy.data.collections[collection])
+    scene.splannequin.shot_path = str(shot)
+    addon("solve.arrival").load_camera(scene, shot)
+    entry = scene.splannequin.made[0]
+    assert entry.camera.library is None and entry.camera == scene.camera
+    assert {name: scene_objects.part(scene, shot, name) for name in scene_objects.PARTS} == {
+        name: getattr(entry, name) for name in scene_objects.PARTS
+    }
+    camera, root = entry.camera, entry.root
+    addon("solve.cameras").build(scene, shot)
+    assert (entry.camera, entry.root) == (camera, root)

@@ -379,3 +379,26 @@ def test_data_shared_by_two_entries_survives_removal_of_one(addon, two, shot):
     assert addon("shot.selection").folders(two) == [shot, shot]
     assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
     assert addon("shot.selection").folders(two) == [shot] and cameras.find(two, shot, "CAMERA") is not None
+
+
+def test_a_shot_on_a_disk_that_is_away_keeps_its_camera(addon, scene, shot, tmp_path):
+    """Another shot of the same name is not taken for the first one, moved."""
+    second_shot = tmp_path / "elsewhere" / shot.name
+    shutil.copytree(shot, second_shot)
+    props, objects = scene.splannequin, addon("shot.scene_objects")
+    props.shot_path = str(shot)
+    addon("solve.arrival").load_camera(scene, shot)
+    camera = scene.camera
+    assert bpy.ops.splannequin.shot_add() == {"FINISHED"}
+    props.shot_path = str(second_shot)
+    shot.rename(shot.with_name("away"))
+    assert objects.of(scene, second_shot) is None
+    addon("solve.arrival").load_camera(scene, second_shot)
+    assert scene.camera != camera and objects.part(scene, shot, "camera") == camera
+    assert objects.part(scene, second_shot, "camera") == scene.camera
+    moved = shot.parent / "moved" / shot.name
+    moved.parent.mkdir()
+    shot.with_name("away").rename(moved)
+    props.active_shot = 0
+    assert bpy.ops.splannequin.locate_shot(directory=f"{moved}/") == {"FINISHED"}
+    assert objects.part(scene, moved, "camera") == camera

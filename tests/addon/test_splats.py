@@ -358,3 +358,15 @@ def test_blender_importer_restores_the_camera_pose(scene, shot, stood, addon, co
         places = [stood.matrix_world @ Vector(p) for p in points()]
         found = pixels_in_blender(scene, camera, places, (16, 12))
         np.testing.assert_allclose(found, pixels_in_solve(shot, frame, contract), atol=2e-3)
+
+
+def test_splats_are_added_though_the_artist_dissolved_the_shots_collection(scene, shot, stood, addon):
+    placed_take(shot, addon, scene)
+    entry = addon("shot.scene_objects").of(scene, shot)
+    for item in list(entry.collection.objects):
+        scene.collection.objects.link(item)
+    bpy.data.collections.remove(entry.collection)
+    addon("shot.scene_objects").tidy(scene)
+    assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
+    item = addon("freeze.splats").find(scene, shot, "freeze")
+    assert item is not None and item.parent == stood

@@ -451,3 +451,42 @@ def test_chosen_look_reaches_the_request(addon, scene, clip, tmp_path):
     look.write_text("LUT_3D_SIZE 2\n" + "".join(f"{r} {g} {b}\n" for b in (0, 1) for g in (0, 1) for r in (0, 1)))
     scene.splannequin.clip, scene.splannequin.lut = str(clip), str(look)
     assert addon("process.steps").STEPS["import"].params(scene).lut == str(look)
+
+
+def test_the_artists_look_comes_back_unless_the_artists_new_view_lacks_it(addon, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    scene.view_settings.look = "AgX - Punchy"
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
+    assert (scene.view_settings.view_transform, scene.view_settings.look) == ("AgX", "AgX - Punchy")
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    scene.view_settings.view_transform = "Filmic"
+    assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}, "also without its view"
+    assert (scene.view_settings.view_transform, scene.view_settings.look) == ("Filmic", "None")
+    assert not [key for key in scene.keys() if key.startswith("splannequin_")]  # noqa: SIM118
+
+
+def test_a_stored_view_that_this_configuration_lacks_does_not_stop_a_removal(addon, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    stored = json.loads(scene["splannequin_settings_before"])
+    stored["view"]["view_transform"] = "ACES 1.0 - SDR Video"
+    scene["splannequin_settings_before"] = json.dumps(stored)
+    assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
+    assert scene.view_settings.view_transform == "Standard"
+
+
+def test_each_take_has_its_own_folder_of_rendered_images(addon, with_shot, shot, tmp_path, new_take):
+    rendering, second_shot = addon("bake.rendering"), tmp_path / "second.splannequin"
+    new_take(shot, "later")
+    shutil.copytree(shot, second_shot)
+    rendering.choose_output(with_shot, shot, "freeze")
+    assert rendering.choose_output(with_shot, shot, "later")
+    assert Path(with_shot.render.filepath) == shot / "bake" / "later" / "######"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
+    scene = bpy.context.scene
+    assert rendering.choose_output(scene, shot, "later") == []
+    assert rendering.choose_output(scene, second_shot, "later"), "nor is one shot rendered over another"
+    assert Path(bpy.path.abspath(scene.render.filepath)) == second_shot / "bake" / "later" / "######"
+    scene.render.filepath = artists = "//second.splannequin/bake/later v2/######"
+    assert rendering.choose_output(scene, shot, "later") == [] and scene.render.filepath == artists
