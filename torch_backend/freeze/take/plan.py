@@ -77,7 +77,7 @@ class FrameSpec:
     detail: Compositor | None = None
     """Composites frames from plates; None: frames are splats alone."""
     detail_key: str = ""
-    """Key of the plates and mattes that `detail` uses; empty without it."""
+    """Key of the plates and mattes that the frames use, from `detail_key`."""
     light: str = LIGHTS[0]
     """Primaries of the written frames, one of `LIGHTS`: those of the footage."""
     passes: Passes | None = None
@@ -251,9 +251,12 @@ def plate_detail(
 
 
 def detail_key(shot: Shot, detail: Compositor | None) -> str:
-    """Key of the plates, mattes and settings of plate detail, without the run; empty without plate detail."""
+    """Key of the plates, mattes and settings of plate detail, without the run.
+
+    Without plate detail: key of the mattes, outside of which plates still measure the frames' depth.
+    """
     if detail is None or not isinstance(detail.plates, Plates):
-        return ""
+        return motion_key(shot)
     return content_key(COMPOSITE_VERSION, detail.plates.key, motion_key(shot), dataclasses.asdict(detail.config))
 
 

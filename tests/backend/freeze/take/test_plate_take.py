@@ -162,8 +162,10 @@ def test_frame_without_its_warp_is_rendered_again(trained, take, quiet):
     assert [name for name in after if after[name] != before[name]] == ["000104.exr"]
 
 
-def test_a_painted_matte_makes_frames_stale(trained, quiet):
-    ask = FreezeParams(take="painted", develop="off", t_star=105, first=110, last=110, only_missing=True)
+@pytest.mark.parametrize("detail", ["on", "off"])
+def test_a_painted_matte_makes_frames_stale(trained, quiet, detail):
+    """Without detail, the mattes still decide where plates measure a frame's depth."""
+    ask = FreezeParams(take="painted", detail=detail, develop="off", t_star=105, first=110, last=110, only_missing=True)
     path = trained.shot.root / PAINTED / "000110.png"
     before = path.read_bytes()
     try:
