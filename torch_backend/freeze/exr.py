@@ -327,6 +327,20 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
     return FrozenFrame(rgba, depth, support, motion, metadata, beyond, grain, detail, more)
 
 
+def read_metadata(path: str | Path) -> FrameMetadata:
+    """Metadata of a file of `write_frozen_exr`, from its header. Raises as `read_frozen_exr`."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
+    image = oiio.ImageInput.open(regular_file(path))
+    if image is None:
+        raise UserError(f"{path}: cannot be read as EXR: {error_of()}")
+    try:
+        return _metadata(image.spec(), path)
+    finally:
+        image.close()
+
+
 def read_key(path: str | Path) -> str | None:
     """`FrameMetadata.key` of a file, from its header; None if the file cannot be read."""
     try:

@@ -22,6 +22,8 @@ from .exr import write_error
 
 ROOT, SPLATS, CAMERA = "/frozen", "/frozen/splats", "/frozen/camera"
 """Paths of the prims."""
+NEAREST = 0.01
+"""Distance at which the camera starts to see, as a share of the splats' median distance from it."""
 REACH = 3.0
 """Radius of a Gaussian in the stage's extent, in standard deviations; 0.3 % of a Gaussian lies outside."""
 
@@ -68,8 +70,10 @@ def write_usd(
             stage: Any = Usd.Stage.Open(layer)
             _describe(stage, UsdGeom, cameras, metres_per_unit, fps)
             stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
-            _add_camera(UsdGeom.Camera.Define(stage, CAMERA), Gf, cameras, transform, metres_per_unit)
+            camera: Any = UsdGeom.Camera.Define(stage, CAMERA)
+            _add_camera(camera, Gf, cameras, transform, metres_per_unit)
             if gaussians is not None:
+                _add_clipping(camera, Gf, cameras, transform, gaussians)
                 _add_splats(UsdVol.ParticleField3DGaussianSplat.Define(stage, SPLATS), Vt, gaussians)
             written = layer.Export(str(partial), args={"format": path.suffix.removeprefix(".")})
         except Tf.ErrorException as error:
@@ -119,6 +123,17 @@ def _add_camera(camera: Any, vectors: Any, path: CameraPath, transform: Similari
         }
         for name, value in values.items():
             varying[name].Set(value * per_mm, *([] if is_fixed else [frame.frame]))
+
+
+def _add_clipping(
+    camera: Any, vectors: Any, path: CameraPath, transform: Similarity, gaussians: PlyGaussians
+) -> None:  # fmt: skip
+    """Sets the range of distances that a camera sees. USD's default starts at one unit, which hides what is nearer."""
+    centres = camera_to_world(transform.viewmats(path_viewmats(path)))[:, :3, 3]
+    distances = np.linalg.norm(gaussians.means - centres.mean(axis=0), axis=1)
+    if len(distances) and np.median(distances) > 0.0:
+        far = 2.0 * (distances.max() + np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+        camera.CreateClippingRangeAttr(vectors.Vec2f(float(NEAREST * np.median(distances)), float(far)))
 
 
 def _add_splats(field: Any, arrays: Any, gaussians: PlyGaussians) -> None:

@@ -7,6 +7,7 @@ from pxr import Gf, Usd, UsdGeom, UsdVol
 from torch_backend.cameras.placement import Similarity, path_viewmats
 from torch_backend.contract import CameraFrame, CameraPath, Placement
 from torch_backend.freeze import usd
+from torch_backend.freeze.placed import placed
 from torch_backend.freeze.usd import CAMERA, ROOT, SPLATS, write_usd
 from torch_backend.gaussians.ply import PlyGaussians
 
@@ -64,6 +65,18 @@ def seen(camera, frame: int, points: np.ndarray, size: tuple[int, int]) -> np.nd
     matrix = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
     ndc = np.array([tuple(matrix.Transform(Gf.Vec3d(*map(float, p)))) for p in points])
     return (ndc[:, :2] * [0.5, -0.5] + 0.5) * size
+
+
+def test_the_camera_sees_splats_in_small_units(tmp_path):
+    """The nearest splats are 0.2 units away. USD's default hides what is nearer than 1 unit."""
+    small = Similarity(WHERE.rotation, 0.01, WHERE.translation)
+    means = np.random.default_rng(1).uniform([-10, -10, 20], [10, 10, 40], (200, 3))
+    splats = placed(cloud(200, 0)._replace(means=means), small)
+    stage = Usd.Stage.Open(str(write_usd(tmp_path / "a.usdc", splats, path(), small, 1.0, 24.0)))
+    frustum = UsdGeom.Camera.Get(stage, CAMERA).GetCamera(Usd.TimeCode(102)).frustum
+    depths = [-frustum.ComputeViewMatrix().Transform(Gf.Vec3d(*map(float, p)))[2] for p in splats.means]
+    assert 0.1 < min(depths) < 0.3
+    assert frustum.nearFar.min < min(depths) and frustum.nearFar.max > max(depths)
 
 
 @pytest.mark.parametrize("varies", [False, True])

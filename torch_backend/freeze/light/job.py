@@ -38,6 +38,7 @@ from ...torch_types import from_numpy, norm
 from ...train import LoadedRun, load_run
 from ..exr import linear_spec, write_exr
 from ..take.frames import scene_linear
+from ..take.splats import refuse_other_solve
 from . import sphere
 
 LIGHT_VERSION = 1
@@ -83,6 +84,7 @@ def make_light(
     if not folder.facts.is_file() or not folder.ply.is_file():
         message = f"{shot.root.name} has no finished take {params.take!r} with splats."
         raise JobError(message, "Freeze it first.", ExitCode.FREEZE)
+    refuse_other_solve(shot, read_json(folder.facts))
     placement = placement_for(shot, params.placement)
     digest = file_digest(folder.facts)
     key = content_key(LIGHT_VERSION, digest, file_digest(folder.ply), point.tolist(), placement.to_json(), vars(config))

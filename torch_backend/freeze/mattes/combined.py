@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, cast
 
 import cv2
@@ -31,11 +32,12 @@ from ...contract import (
 from ...footage.images import read_png, write_png
 from ...footage.plates import Plates
 from ...shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, remove_file, write_json
-from ..exr import DetailLayers, FrozenFrame, read_frozen_exr, read_key, write_frozen_exr
+from ..exr import DetailLayers, FrozenFrame, read_frozen_exr, read_key, read_metadata, write_frozen_exr
 from ..take.contact_sheet import write_contact_sheet
 from ..take.folder import frames_of
 from ..take.video import write_video
 from .files import is_current, matte_file, read_matte
+from .job import current_keys
 
 VERSION = 4
 """Version of combined frames. Raise it when older ones must not be used any more."""
@@ -61,6 +63,8 @@ class Source:
     """Name of a finished matte -> key of its files."""
     matte_format: str
     """Suffix of the take's single mattes."""
+    is_stale: bool = False
+    """True if the mattes were made for other frames than the take has now."""
 
     @property
     def margin(self) -> tuple[int, int]:
@@ -105,6 +109,12 @@ def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, An
     folder = TakeFolder(shot.own(shot.take(checked_name(params.take, "take"))))
     _refuse_frozen(folder, params)
     live = Plates(shot, (int(base.facts["width"]), int(base.facts["height"]))) if None in sources.values() else None
+    lacking = [] if live is None else sorted(set(frames) - set(live.frames))
+    if lacking:
+        report.warning(
+            f"The footage lacks {len(lacking)} frames of the take, the first is {lacking[0]}: in them, what should "
+            f"keep moving stands still as in take {params.base}."
+        )
     for inner in (folder.root, folder.previews):
         make_folder(shot.own(inner))
         sweep_half_written(inner)
@@ -210,7 +220,8 @@ def _opened(shot: Shot, name: str) -> Source:
         record = read_json(folder.mattes_record)
     keys = record.get("keys") if record.get("finished") else None
     known = {name: str(key) for name, key in cast("dict[str, Any]", keys or {}).items()}
-    return Source(name, folder, facts, known, str(record.get("format", "exr")))
+    is_stale = bool(known) and known != current_keys(folder, facts)
+    return Source(name, folder, facts, known, str(record.get("format", "exr")), is_stale)
 
 
 def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source | None]) -> list[int]:
@@ -225,6 +236,12 @@ def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source
                     "Draw it there, or create its mattes again.",
                     ExitCode.FREEZE,
                 )
+            if candidate is not None and candidate.is_stale:
+                raise JobError(
+                    f"The mattes of take {candidate.name} were made for other frames than it has now.",
+                    "Create its mattes again.",
+                    ExitCode.FREEZE,
+                )
         if source is None:
             if base.facts.get("camera_path"):
                 raise JobError(
@@ -233,16 +250,31 @@ def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source
                 )  # fmt: skip
             continue
         placed = ("placement",) if base.facts.get("passes") else ()  # the layer Position depends on it
-        for name in ("width", "height", "margin", "camera_path", "shutter", *placed):
+        for name in ("width", "height", "margin", "shutter", *placed):
             if (source.facts.get(name) or 0) != (base.facts.get(name) or 0):
                 raise JobError(
                     f"Takes {base.name} and {source.name} differ in {name.replace('_', ' ')}.",
                     "Freeze both with the same size, overscan, camera and motion blur.", ExitCode.FREEZE,
                 )  # fmt: skip
-        frames &= set(frames_of(source.folder))
+        both = frames & set(frames_of(source.folder))
+        # A camera path may be stored in a file for each take, and a file may have changed since.
+        if bool(source.facts.get("camera_path")) != bool(base.facts.get("camera_path")) or not all(
+            _is_same_camera(base.folder.frame(n), source.folder.frame(n)) for n in both
+        ):
+            raise JobError(
+                f"Takes {base.name} and {source.name} differ in camera.",
+                "Freeze both with the same size, overscan, camera and motion blur.", ExitCode.FREEZE,
+            )  # fmt: skip
+        frames = both
     if not frames:
         raise JobError("The takes have no frame in common.", "Freeze the same frames of each.", ExitCode.FREEZE)
     return sorted(frames)
+
+
+def _is_same_camera(one: Path, two: Path) -> bool:
+    """True if two frozen frames have the same pose and intrinsics, up to rounding."""
+    a, b = read_metadata(one), read_metadata(two)
+    return np.allclose(a.viewmat, b.viewmat, 1e-4, 1e-4) and np.allclose(a.K, b.K, 1e-4)
 
 
 def _refuse_frozen(folder: TakeFolder, params: CombineParams) -> None:
@@ -273,6 +305,8 @@ def _write_frame(
     inner = slice(down, height - down), slice(across, width - across)
     for matte, take in things.items():
         source = sources[take]
+        if source is None and live is not None and number not in live.frames:
+            continue
         shows = base.shows(matte, number, frame, is_live=source is None)
         if source is None:
             assert live is not None

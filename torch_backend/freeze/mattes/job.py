@@ -114,6 +114,17 @@ def stored_lassos(folder: TakeFolder, width: int, height: int) -> list[Lasso]:
     return [lasso_of(row, f"Lasso {n} of {folder.mattes_record}", width, height) for n, row in enumerate(rows, 1)]
 
 
+def current_keys(folder: TakeFolder, facts: dict[str, Any]) -> dict[str, str]:
+    """Name -> key that each matte of a take has if it was made for the take's present frames.
+
+    `facts`: content of take.json. JobError if the record of its mattes is damaged.
+    """
+    lassos_by_name: dict[str, list[Lasso]] = {}
+    for lasso in stored_lassos(folder, int(facts["width"]), int(facts["height"])):
+        lassos_by_name.setdefault(lasso.name, []).append(lasso)
+    return _keys(_Take(folder, facts, frames_of(folder)), lassos_by_name)
+
+
 def _opened(shot: Shot, name: str) -> _Take:
     """A finished take. JobError if it does not exist, is damaged, or is combined from others."""
     folder = TakeFolder(shot.own(shot.take(name)))

@@ -137,9 +137,10 @@ def view_of(path: Path, config: SurfaceConfig) -> View:
     def small(layer: NDArray[Any], method: int = cv2.INTER_AREA) -> NDArray[Any]:
         return cv2.resize(layer, (w, h), interpolation=method)
 
-    depth = small(frame.depth, cv2.INTER_NEAREST)
+    # INTER_NEAREST takes the first pixel of every block, which is half a block away from the new pixel's centre.
+    depth = small(frame.depth, cv2.INTER_NEAREST_EXACT)
     sigma = frame.more.get("DepthSigma")  # takes of earlier versions lack it
-    error = np.zeros_like(depth) if sigma is None else small(sigma, cv2.INTER_NEAREST)
+    error = np.zeros_like(depth) if sigma is None else small(sigma, cv2.INTER_NEAREST_EXACT)
     is_known = (depth < NO_DEPTH) & (depth > 0) & (small(frame.rgba[..., 3]) > 0.5)
     return View(
         frame.metadata.viewmat.astype(np.float64),

@@ -43,7 +43,11 @@ class Passes:
 
     def facts(self, output: OutputFrame) -> list[Any]:
         """Inputs of a frame's passes for its key, in addition to the inputs of its picture."""
-        near = [floats(frame.viewmat.flatten()) for frame in self._adjacent(output) if frame is not None]
+        near = [
+            (frame.frame, floats(frame.viewmat.flatten()), floats(frame.K.flatten()))
+            for frame in self._adjacent(output)
+            if frame is not None
+        ]
         return [self.to_scene.matrix.flatten().tolist(), near]
 
     def of(self, output: OutputFrame, K: Tensor, depth: Tensor) -> dict[str, LazyLayer]:

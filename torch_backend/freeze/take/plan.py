@@ -77,7 +77,7 @@ class FrameSpec:
     detail: Compositor | None = None
     """Composites frames from plates; None: frames are splats alone."""
     detail_key: str = ""
-    """Key of the plates and mattes that `detail` uses; empty without it."""
+    """Key of the plates and mattes that the frames use, from `detail_key`."""
     light: str = LIGHTS[0]
     """Primaries of the written frames, one of `LIGHTS`: those of the footage."""
     passes: Passes | None = None
@@ -181,7 +181,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     plate = (shot.info().width, round(shot.info().width * height / width))
     if params.detail == "on" or params.develop == "on":
         find_motion(shot, report)  # for shots solved by versions whose solve did not find motion
-    detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
+    detail = plate_detail(shot, scene, run, params, whole, (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
     blur, placed = _motion_blur(whole, params, report), Similarity.of(placement_for(shot, params.placement))
     if params.deep and blur is not None:
@@ -230,17 +230,19 @@ def _refuse_combined(folder: TakeFolder) -> None:
 
 
 def plate_detail(
-    shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, first: OutputFrame, size: tuple[int, int],
-    report: Reporter,
+    shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, frames: Sequence[OutputFrame],
+    size: tuple[int, int], report: Reporter,
 ) -> Compositor | None:  # fmt: skip
-    """The compositor of a take; None if `params` selects splats alone. `first` is any frame of the take.
+    """The compositor of a take; None if `params` selects splats alone. `frames` are all frames of the take.
 
-    The shot's motion mattes must exist. Plates are read at the pixel scale of the frames, by default at full size.
+    The shot's motion mattes must exist. Plates are read at the pixel scale of the frame with the longest lens, by
+    default at full size.
     """
     if params.detail == "off":
         return None
     plates = Plates(shot)
-    scale = float(first.K[0, 0]) / float(scene.Ks[0, 0, 0] * plates.width / scene.width)
+    focal = max(float(frame.K[0, 0]) for frame in frames)
+    scale = focal / float(scene.Ks[:, 0, 0].min() * plates.width / scene.width)
     if not params.camera_path and size != (plates.width, plates.height):
         plates = Plates(shot, size)
     elif params.camera_path and scale < 0.99:
@@ -251,9 +253,12 @@ def plate_detail(
 
 
 def detail_key(shot: Shot, detail: Compositor | None) -> str:
-    """Key of the plates, mattes and settings of plate detail, without the run; empty without plate detail."""
+    """Key of the plates, mattes and settings of plate detail, without the run.
+
+    Without plate detail: key of the mattes, outside of which plates still measure the frames' depth.
+    """
     if detail is None or not isinstance(detail.plates, Plates):
-        return ""
+        return motion_key(shot)
     return content_key(COMPOSITE_VERSION, detail.plates.key, motion_key(shot), dataclasses.asdict(detail.config))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -12,6 +13,7 @@ from ...cameras.stored import load_cameras
 from ...contract import (
     PLY_FILE,
     USD_FILE,
+    CameraFrame,
     CameraPath,
     ExitCode,
     JobError,
@@ -23,12 +25,14 @@ from ...contract import (
     read_json,
 )
 from ...gaussians.ply import PlyGaussians, read_ply, write_ply
-from ...scene import Scene
+from ...scene import Scene, load_scene
 from ...shot import Shot, remove_file
 from ...torch_types import from_numpy
+from ..exr import read_metadata
 from ..frozen import FrozenGaussians
 from ..placed import placed
 from ..usd import NoUsdError, write_usd
+from .folder import frames_of
 
 FORMATS = ("ply", "usd")
 _NO_USD = (
@@ -53,11 +57,40 @@ def placed_splats(frozen: FrozenGaussians, scene: Scene, transform: Similarity) 
 
 
 def camera_path_of(shot: Shot, file: str) -> CameraPath:
-    """The camera path of a take, solve units: the path `file` from Blender if it exists, else the clip's own.
+    """The camera path of a take, solve units: the path `file` from Blender, or the clip's own if it is empty.
 
     Raises the errors of `CameraPath.load` and `load_cameras`.
     """
-    return CameraPath.load(file) if file and Path(file).is_file() else load_cameras(shot)
+    return CameraPath.load(file) if file else load_cameras(shot)
+
+
+def refuse_other_solve(shot: Shot, facts: dict[str, Any]) -> None:
+    """Raises JobError if the shot was solved again after a take was frozen. `facts`: content of its take.json.
+
+    The splats of such a take have the axes and units of the former solve, which no placement of the new one fits.
+    """
+    scale = facts.get("scale")  # takes of early versions lack it
+    if isinstance(scale, float) and not math.isclose(scale, load_scene(shot).scale, rel_tol=1e-6):
+        raise JobError(
+            f"The camera of {shot.root.name} was solved again after the take was frozen.",
+            "Train the run and freeze the take again.",
+            ExitCode.USAGE,
+        )
+
+
+def _frozen_cameras(take: TakeFolder, facts: dict[str, Any]) -> CameraPath:
+    """The cameras of a take's frames, solve units, from their EXRs: the file of its path may be moved or changed.
+
+    JobError if the take has no frames.
+    """
+    frames: list[CameraFrame] = []
+    for number in frames_of(take):
+        seen = read_metadata(take.frame(number))
+        lens = [float(seen.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
+        frames.append(CameraFrame(number, seen.viewmat.ravel().tolist(), lens, "blender"))
+    if not frames:
+        raise JobError(f"Take {take.root.name} has no frames.", "Freeze it again.", ExitCode.USAGE)
+    return CameraPath(int(facts["width"]), int(facts["height"]), frames)
 
 
 def write_stage(
@@ -90,7 +123,7 @@ def export_splats(shot: Shot, kind: str, folder: Path, take: str, placement: str
 
     Raises:
         ValueError: unknown format, or `placement` or the take's files are damaged.
-        JobError: the take does not exist, or the environment cannot write USD.
+        JobError: the take does not exist or is of another solve, or the environment cannot write USD.
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
@@ -98,12 +131,13 @@ def export_splats(shot: Shot, kind: str, folder: Path, take: str, placement: str
     if not take_folder.facts.is_file() or not take_folder.ply.is_file():
         raise JobError(f"Take {take} of {shot.root.name} has no splats.", "Freeze it first.", ExitCode.USAGE)
     facts = read_json(take_folder.facts)
+    refuse_other_solve(shot, facts)
     target = placement_for(shot, placement)
     change = Similarity.of(target).after(Similarity.of(placement_of(facts)).inverse())
     splats = placed(read_ply(take_folder.ply), change)
     if kind == "ply":
         return [write_ply(folder / PLY_FILE, *splats)]
-    cameras = camera_path_of(shot, str(facts.get("camera_path", "")))
+    cameras = _frozen_cameras(take_folder, facts) if facts.get("camera_path") else load_cameras(shot)
     transform, fps = Similarity.of(target), shot.info().fps or PLAIN_FPS
     try:
         return [write_usd(folder / USD_FILE, splats, cameras, transform, target.metres_per_unit, fps)]

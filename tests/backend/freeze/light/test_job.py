@@ -255,6 +255,18 @@ def test_missing_run_drops_exposure_with_a_warning(take, quiet):
     assert [event for event in report.events if event[0] == "warning"]
 
 
+def test_a_take_of_a_former_solve_gives_no_light(take, quiet):
+    """Its splats have other axes and units than the point."""
+    world, folder = take
+    kept = folder.facts.read_text(encoding="utf-8")
+    try:
+        write_json(folder.facts, {**json.loads(kept), "scale": 1.3 * load_scene(world.shot).scale})
+        with pytest.raises(JobError, match="solved again"):
+            make_light(world.shot, params(), quiet(), SMALL)
+    finally:
+        folder.facts.write_text(kept, encoding="utf-8")
+
+
 def test_uncreatable_paths_give_a_readable_error(take, quiet):
     world, folder = take
     with pytest.raises(JobError, match="no finished take"):

@@ -9,7 +9,16 @@ import pytest
 import torch
 
 from tests.backend.conftest import outline
-from torch_backend.contract import CombineParams, FreezeParams, JobError, MatteParams, SurfaceParams, TakeFolder
+from torch_backend.contract import (
+    CameraFrame,
+    CameraPath,
+    CombineParams,
+    FreezeParams,
+    JobError,
+    MatteParams,
+    SurfaceParams,
+    TakeFolder,
+)
 from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_shot
@@ -17,6 +26,7 @@ from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.mattes.combined import Source, combine, combined, dilated, with_motion
 from torch_backend.freeze.mattes.job import make_mattes
 from torch_backend.freeze.surface.job import make_surface
+from torch_backend.shot import write_json
 
 FIRST, LAST = 104, 111
 INSTANTS = {"early": 105, "late": 113}
@@ -122,6 +132,61 @@ def test_what_cannot_be_combined_is_said(world, quiet):
         make_surface(world.shot, SurfaceParams(take="mine"), quiet())
     freeze_shot(world.shot, FreezeParams(take="wide", t_star=105, first=FIRST, last=LAST, width=128), quiet())
     refused("has no matte", base="wide")
+
+
+def from_path(world, quiet, tmp_path, take, t_star, shift=0.0):
+    """A take of splats from a camera path of its own, with the patch's matte."""
+    frames = []
+    for n in (106, 107, 108):
+        viewmat = world.viewmats[n - 101].clone()
+        viewmat[0, 3] += shift
+        frames.append(CameraFrame(n, viewmat.flatten().tolist(), [60.0, 60.0, 32.0, 24.0], "blender"))
+    file = tmp_path / f"{take}.json"
+    write_json(file, CameraPath(64, 48, frames).to_json())
+    params = FreezeParams(take=take, t_star=t_star, camera_path=str(file), detail="off", develop="off")
+    freeze_shot(world.shot, params, quiet())
+    row = {"name": "patch", "frame": 107, "polygon": outline(covered(world, 107, t_star))}
+    (tmp_path / "lassos.json").write_text(json.dumps({"mattes": [row]}), encoding="utf-8")
+    make_mattes(world.shot, MatteParams(take=take, polygons=str(tmp_path / "lassos.json")), quiet())
+
+
+def test_takes_combine_if_their_cameras_are_the_same_whatever_the_files_are_called(world, quiet, tmp_path):
+    from_path(world, quiet, tmp_path, "one", 105)
+    from_path(world, quiet, tmp_path, "two", 113)
+    params = CombineParams(take="own", base="one", things="patch=two")
+    assert combine(world.shot, params, quiet())["frames"] == 3
+    from_path(world, quiet, tmp_path, "two", 113, shift=0.2)
+    with pytest.raises(JobError, match="one and two differ in camera"):
+        combine(world.shot, params, quiet())
+
+
+def test_mattes_of_frames_that_were_frozen_again_are_refused(world, quiet):
+    """The old matte shows where the patch stood at the old instant."""
+    ask = {"take": "early", "first": FIRST, "last": LAST, "passes": True}
+    params = CombineParams(take="stale", base="early", things="patch=late")
+    freeze_shot(world.shot, FreezeParams(**ask, t_star=109), quiet())
+    try:
+        with pytest.raises(JobError, match="mattes of take early were made for other frames"):
+            combine(world.shot, params, quiet())
+        make_mattes(world.shot, MatteParams(take="early"), quiet())
+        combine(world.shot, params, quiet())
+    finally:
+        freeze_shot(world.shot, FreezeParams(**ask, t_star=INSTANTS["early"]), quiet())
+        make_mattes(world.shot, MatteParams(take="early"), quiet())
+
+
+def test_a_live_object_is_left_out_of_frames_without_a_plate(world, quiet):
+    record = json.loads(world.shot.listing.read_text())
+    kept = {**record, "frames": [row for row in record["frames"] if row["frame"] != 107]}
+    report = quiet()
+    try:
+        world.shot.listing.write_text(json.dumps(kept))
+        combine(world.shot, CombineParams(take="gap", base="early", things="patch=live"), report)
+    finally:
+        world.shot.listing.write_text(json.dumps(record))
+    assert any(event[0] == "warning" and "107" in event[1] for event in report.events)
+    for layer in ("rgba", "depth", "support", "motion"):
+        np.testing.assert_array_equal(*(getattr(frame_of(world, take, 107), layer) for take in ("gap", "early")))
 
 
 def test_mask_selects_between_two_layers():

@@ -7,9 +7,11 @@ import pytest
 
 from torch_backend import contract
 from torch_backend.cameras.placement import Similarity
-from torch_backend.contract import Cancelled, FreezeParams, JobError, SurfaceParams, TakeFolder
+from torch_backend.contract import NO_DEPTH, Cancelled, FreezeParams, JobError, SurfaceParams, TakeFolder
 from torch_backend.freeze import freeze_shot
-from torch_backend.freeze.surface.job import make_surface, read_surface
+from torch_backend.freeze.exr import FrameMetadata, write_frozen_exr
+from torch_backend.freeze.surface.job import make_surface, read_surface, view_of
+from torch_backend.freeze.surface.volume import SurfaceConfig, unprojected
 from torch_backend.raster import rasterize
 
 T_STAR = 105
@@ -61,6 +63,20 @@ def test_the_surface_is_the_true_one(take, quiet):
     assert np.median(middles[people][:, 2]) < np.median(middles[~people][:, 2]) == pytest.approx(4.0, abs=0.1)
     red = colors[np.unique(triangles[people])].astype(float)
     assert red[:, 0].mean() > 2 * red[:, 1:].mean(), "the patch is red"
+
+
+def test_a_large_frames_floor_stays_where_it_is(tmp_path):
+    """Depth falls by 5 % from one fused pixel's rows to the next, so that half a pixel would move the floor."""
+    width, height, focal, above = 960, 540, 800.0, 1.5
+    rows = np.arange(height) + 0.5 - height / 2
+    depth = np.where(rows > 60, above * focal / np.maximum(rows, 1.0), NO_DEPTH)[:, None].repeat(width, 1)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
+    ones, path = np.ones((height, width), np.float32), tmp_path / "000001.exr"
+    rgba = np.ones((height, width, 4), np.float32)
+    write_frozen_exr(path, rgba, depth, ones, 0 * ones, FrameMetadata(1, 1.0, np.eye(4, dtype=np.float32), K))
+    points = unprojected(view_of(path, SurfaceConfig()))[0]
+    assert len(points) > 10_000
+    assert abs(points[:, 1].mean() - above) < 0.003 and np.abs(points[:, 1] - above).max() < 0.03
 
 
 def test_surface_is_cached_and_recomputed_with_the_take(take, quiet):

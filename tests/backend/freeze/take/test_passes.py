@@ -1,5 +1,6 @@
 """Passes of frozen frames: a tilted plane compared with geometry, and a take compared with its depth and cameras."""
 
+import dataclasses
 import math
 from itertools import pairwise
 from types import SimpleNamespace
@@ -92,6 +93,15 @@ def test_at_the_ends_of_a_take_nothing_is_beyond():
     depth, _ = plane_depth(FRAMES[2])
     last = computed(FRAMES[2], depth)["Vector"]
     assert np.abs(last[..., :2]).max() > 0.1 and not last[..., 2:].any()
+
+
+def test_a_zoom_of_the_next_frame_changes_the_facts_that_its_motion_vectors_depend_on():
+    zoomed = dataclasses.replace(FRAMES[2], K=FRAMES[2].K * torch.tensor([[1.2], [1.2], [1.0]]))
+    depth, _ = plane_depth(FRAMES[1])
+    plain, changed = Passes(FRAMES, SCENE, TURNED), Passes([*FRAMES[:2], zoomed], SCENE, TURNED)
+    vectors = [p.of(FRAMES[1], FRAMES[1].K, torch.from_numpy(depth))["Vector"][slice(0, H)] for p in (plain, changed)]
+    assert np.abs(vectors[0] - vectors[1]).max() > 0.5, "or the test says nothing"
+    assert plain.facts(FRAMES[1]) != changed.facts(FRAMES[1])
 
 
 def test_a_takes_passes_lie_on_its_cameras(trained, tmp_path, quiet):

@@ -15,7 +15,7 @@ import torch
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from tests.backend.conftest import film
-from torch_backend.contract import CameraPath, FreezeParams, TrainParams
+from torch_backend.contract import CameraFrame, CameraPath, FreezeParams, TrainParams
 from torch_backend.footage.color import InputSpace, linear_to_srgb
 from torch_backend.footage.display import ROLLED
 from torch_backend.footage.images import read_png
@@ -24,7 +24,9 @@ from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.composite.state import StateConfig, rejection
 from torch_backend.freeze.composite.warp import apply_warp, read_warp
 from torch_backend.freeze.exr import read_frozen_exr, read_key
+from torch_backend.freeze.take.plan import planned
 from torch_backend.motion.mattes import PAINTED, STILL, write_matte
+from torch_backend.shot import write_json
 from torch_backend.train import train_shot
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -162,8 +164,10 @@ def test_frame_without_its_warp_is_rendered_again(trained, take, quiet):
     assert [name for name in after if after[name] != before[name]] == ["000104.exr"]
 
 
-def test_a_painted_matte_makes_frames_stale(trained, quiet):
-    ask = FreezeParams(take="painted", develop="off", t_star=105, first=110, last=110, only_missing=True)
+@pytest.mark.parametrize("detail", ["on", "off"])
+def test_a_painted_matte_makes_frames_stale(trained, quiet, detail):
+    """Without detail, the mattes still decide where plates measure a frame's depth."""
+    ask = FreezeParams(take="painted", detail=detail, develop="off", t_star=105, first=110, last=110, only_missing=True)
     path = trained.shot.root / PAINTED / "000110.png"
     before = path.read_bytes()
     try:
@@ -176,6 +180,17 @@ def test_a_painted_matte_makes_frames_stale(trained, quiet):
         assert keys[0] == keys[1] != keys[2]
     finally:
         path.write_bytes(before)
+
+
+def test_a_zoom_reads_plates_as_fine_as_its_longest_lens(trained, quiet, tmp_path):
+    widths = []
+    for focals in ((30.0, 30.0), (30.0, 90.0), (90.0, 30.0)):
+        pose = trained.viewmats[7].flatten().tolist()
+        frames = [CameraFrame(n, pose, [f, f, 32.0, 24.0], "blender") for n, f in enumerate(focals, 1)]
+        write_json(tmp_path / "zoom.json", CameraPath(64, 48, frames).to_json())
+        params = FreezeParams(take="zoom", develop="off", t_star=108, camera_path=str(tmp_path / "zoom.json"))
+        widths.append(planned(trained.shot, params, quiet()).spec.detail.plates.width)
+    assert widths == [32, 64, 64]
 
 
 def test_a_ramp_that_runs_is_the_clip(trained, quiet):

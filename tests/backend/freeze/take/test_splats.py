@@ -9,7 +9,16 @@ from pxr import Usd, UsdGeom, UsdVol
 
 from torch_backend.cameras.placement import Similarity
 from torch_backend.cameras.stored import load_cameras
-from torch_backend.contract import FreezeParams, JobError, Placement, UserError, file_digest, write_json
+from torch_backend.contract import (
+    CameraFrame,
+    CameraPath,
+    FreezeParams,
+    JobError,
+    Placement,
+    UserError,
+    file_digest,
+    write_json,
+)
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take.splats import export_splats, write_stage
@@ -129,6 +138,42 @@ def test_a_take_of_an_earlier_version_is_placed_from_the_solves_axes(taken, tmp_
         path.write_text(kept)
     was = read_ply(facts["ply"]).means
     np.testing.assert_allclose(read_ply(written).means, was[:, [0, 2, 1]] * [1, 1, -1], rtol=1e-6)
+
+
+def test_the_stage_of_an_own_camera_holds_it_although_its_file_is_gone(trained, quiet, tmp_path):
+    """The shot was moved, or the file belongs to another computer: the clip's camera would show another picture."""
+    viewmat = trained.viewmats[7].clone()
+    frames = []
+    for n in (106, 107):
+        viewmat[0, 3] += 0.3
+        frames.append(CameraFrame(n, viewmat.flatten().tolist(), [80.0, 80.0, 30.0, 25.0], "blender"))
+    write_json(tmp_path / "own.json", CameraPath(*SIZE, frames).to_json())
+    params = FreezeParams(
+        take="own", t_star=105, detail="off", develop="off", camera_path=str(tmp_path / "own.json"), width=SIZE[0]
+    )
+    before = camera_of(Usd.Stage.Open(freeze_shot(trained.shot, params, quiet())["usd"]), 107)
+    (tmp_path / "own.json").unlink()
+    (written,) = export_splats(trained.shot, "usd", tmp_path / "out", "own")
+    stage = Usd.Stage.Open(str(written))
+    for now, then in zip(camera_of(stage, 107), before, strict=True):
+        np.testing.assert_allclose(now, then, rtol=1e-4, atol=1e-4)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (106, 107)
+
+
+@pytest.mark.parametrize("kind", ["ply", "usd"])
+def test_a_take_of_a_former_solve_is_not_placed_with_the_new_one(taken, tmp_path, kind):
+    shot, _ = taken
+    kept = shot.cameras.read_text()
+    solved = json.loads(kept)
+    for frame in solved["frames"]:
+        frame["viewmat"][3::4] = [1.3 * v for v in frame["viewmat"][3:12:4]] + [1.0]
+    try:
+        shot.cameras.write_text(json.dumps(solved))
+        with pytest.raises(JobError, match="solved again"):
+            export_splats(shot, kind, tmp_path, "placed")
+    finally:
+        shot.cameras.write_text(kept)
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_cannot_be_exported_is_said(taken, tmp_path):
