@@ -48,7 +48,6 @@ WALKS = (
     "bad_frames",
     "self_test",
     "station",
-    "composited",
 )
 """Walks that run together in one process, because importing torch takes half the time of a walk."""
 

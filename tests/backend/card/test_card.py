@@ -20,7 +20,7 @@ def test_recorded_steps_do_what_launched_ones_do(walk):
     """Results are bit-identical, with growth, the gate, anchors, the field's penalty, and new frames and times per
     replay."""
     results = walk("recorded")["hexplane"]
-    assert results["replayed"] >= 20 and results["refused"] == "" and results["moving"] > 0
+    assert results["replayed"] >= 14 and results["refused"] == "" and results["moving"] > 0
     assert results["off"] == 0.0, results["worst"]
 
 
@@ -80,7 +80,7 @@ def test_a_card_is_tested_before_its_first_use(walk):
 
 
 def test_a_frame_is_composited_on_a_card_as_on_the_processor(walk):
-    results = walk("composited")
+    results = walk("station")["composited"]
     assert results["devices"] == ["cuda"] and results["filled"] > 0.5
     assert max(results["error"].values()) < 5e-4
     assert sum(results["waits"].values()) <= 40, results["waits"]

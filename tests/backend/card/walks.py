@@ -98,7 +98,7 @@ def recorded(folder: Path, *methods: str) -> dict[str, Any]:
                 trainer.config.densify.every = 10
                 recorder = trainer.recorder
                 trainer.recorder = recorder if records else None
-                _steps(trainer, 32)
+                _steps(trainer, 22)  # with two rounds of growth
                 model = trainer.model.gaussians
                 values = {name: p.detach()._real.double() for name, p in trainer.named_tensors().items()}
                 values |= {name: getattr(model, name)._real.double() for name in ("support", "hidden")}
@@ -165,7 +165,7 @@ def resume(folder: Path, method: str) -> dict[str, Any]:
 
 
 def station(folder: Path) -> dict[str, Any]:
-    """Train, extend, freeze and draw live: all stations of a shot."""
+    """Train, extend, freeze, draw live and composite: all stations of a shot."""
     from torch_backend.contract import FreezeParams, LiveView, TrainParams
     from torch_backend.freeze import freeze_shot
     from torch_backend.live import LiveSession
@@ -188,22 +188,20 @@ def station(folder: Path) -> dict[str, Any]:
     return {
         "device": trained["device"], "iterations": [trained["iterations"], extended["iterations"]],
         "frames": frozen["frames"], "drawn": len(drawn[1]), "launched": sorted(CARD.launched),
+        "composited": composited(world),
     }  # fmt: skip
 
 
-def composited(folder: Path) -> dict[str, Any]:
-    """A frozen frame of plates on the card and on the processor: errors, and synchronisations on the card."""
+def composited(world: Any) -> dict[str, Any]:
+    """A frozen frame of plates of run `g` on the card and on the processor: errors, and the card's waits."""
     import torch
 
-    from torch_backend.contract import TrainParams
     from torch_backend.footage.plates import Plates
     from torch_backend.freeze.composite.compositor import Compositor
     from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen
     from torch_backend.scene import load_scene
-    from torch_backend.train import load_run, train_shot
+    from torch_backend.train import load_run
 
-    world, quiet = small_world(folder)
-    train_shot(world.shot, TrainParams(run="g", iterations=10, max_gaussians=260, device="cpu", holdout=0), quiet())
     scene, plates = load_scene(world.shot), Plates(world.shot)
     K, (t_star, frame) = scene.camera_at(plates.width, plates.height)[6], (scene.frames[1], scene.frames[6])
     output = OutputFrame(frame, scene.viewmats[6], K, float(t_star), float(frame))
@@ -341,7 +339,6 @@ def self_test(folder: Path) -> dict[str, Any]:
 WALKS = {
     "steps": steps, "recorded": recorded, "launches": launches, "resume": resume, "station": station,
     "step_bytes": step_bytes, "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test,
-    "composited": composited,
 }  # fmt: skip
 
 if __name__ == "__main__":

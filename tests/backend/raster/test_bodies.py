@@ -37,7 +37,7 @@ def test_room_matches_the_reference(small_room, body):
 
 
 @on_compiled_bodies
-@pytest.mark.parametrize(("degree", "antialiased"), [(0, True), (1, False), (2, True), (3, False), (3, True)])
+@pytest.mark.parametrize(("degree", "antialiased"), [(0, True), (2, False), (3, True)])
 def test_harmonics_depth_and_pose(body, degree, antialiased):
     settings = RasterSettings(threads=2, antialiased=antialiased)
     scene = cloud(150, 37, 29, seed=degree, channels=5, degree=degree, with_depth=True, settings=settings)
@@ -53,7 +53,7 @@ def test_harmonics_depth_and_pose(body, degree, antialiased):
 
 
 @on_compiled_bodies
-@pytest.mark.parametrize("channels", [1, 8, 21])
+@pytest.mark.parametrize("channels", [1, 21])
 def test_any_number_of_channels(body, channels):
     scene = cloud(80, 33, 20, seed=channels, channels=channels)
     out, grads = ran(scene, body)
@@ -64,7 +64,7 @@ def test_any_number_of_channels(body, channels):
 
 
 @on_compiled_bodies
-@pytest.mark.parametrize("degree", [None, 1, 2])
+@pytest.mark.parametrize("degree", [None, 2])
 def test_cameras_of_a_batch_are_independent_and_their_gradients_add(body, degree):
     scene = cloud(80, 30, 22, seed=4, degree=degree, with_contributions=True, with_top=True)
     single = scene.tensors["viewmats"].clone()

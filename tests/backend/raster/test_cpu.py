@@ -1,6 +1,5 @@
 """The CPU backend alone; test_bodies.py compares images and gradients of every backend with the float64 reference."""
 
-import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -8,7 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from torch_backend.raster import RasterSettings
+from torch_backend.native import build, initialised_warp
+from torch_backend.raster import RasterSettings, cpu_source
 
 
 def test_a_median_depth_is_where_half_is_crossed_or_that_of_the_largest_weight(tools):
@@ -27,9 +27,9 @@ def test_a_median_depth_is_where_half_is_crossed_or_that_of_the_largest_weight(t
 
 
 @pytest.mark.parametrize("body", ["cpu", "reference"])
-@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_split_harmonics_equal_joined_ones(tools, body, degree):
-    scene = tools.cloud(300, 50, 41, degree=3)
+    scene = tools.cloud(100, 50, 41, degree=3)
     together, expected = scene.gradients(body, sh_degree=degree)
     sh = scene.tensors["sh"]
     scene.tensors.update(sh=sh[:, :1].clone(), sh_rest=sh[:, 1:].clone())
@@ -43,7 +43,7 @@ def test_split_harmonics_equal_joined_ones(tools, body, degree):
 @pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_gradients_of_invisible_gaussians_are_zero_in_reused_memory(tools, cameras, split):
-    scene = tools.cloud(700, 50, 41, degree=2)
+    scene = tools.cloud(200, 50, 41, degree=2)
     scene.tensors["means"][::3, 2] = -5.0  # behind the camera
     tensors = scene.tensors | {"viewmats": scene.tensors["viewmats"].repeat(cameras, 1, 1)}
     if split:
@@ -56,7 +56,7 @@ def test_gradients_of_invisible_gaussians_are_zero_in_reused_memory(tools, camer
     finally:
         torch.use_deterministic_algorithms(False)
     tools.assert_gradients(grads, expected, 1e-3)
-    assert all((grad[::3] == 0).all() for name, grad in grads.items() if len(grad) == 700)
+    assert all((grad[::3] == 0).all() for name, grad in grads.items() if len(grad) == 200)
 
 
 def test_mismatched_split_harmonics_are_refused(tools):
@@ -131,8 +131,14 @@ def test_concurrent_callers_do_not_disturb_each_other(tools):
         assert all(torch.equal(grad, single[i % 3][1][name]) for name, grad in grads.items())
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
-def test_forked_child_creates_new_threads():
+def test_compiling_is_silent(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(initialised_warp().config, "kernel_cache_dir", str(tmp_path))
+    build("silent", cpu_source.blend_source(1))
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()), "the kernel was compiled elsewhere"
+
+
+def test_a_first_call_is_silent_and_forked_children_create_new_threads(tmp_path):
     code = """
 import os, torch
 from torch_backend.raster import RasterSettings, rasterize
@@ -143,23 +149,13 @@ def run():
                      torch.ones(3000, 1), viewmats=e, Ks=e[:, :3, :3] * 30, width=90, height=70,
                      settings=RasterSettings(threads=3))
 run()
-child = os.fork()
-if child == 0:
-    run()
-    os._exit(7)
-assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+if hasattr(os, "fork"):
+    child = os.fork()
+    if child == 0:
+        run()
+        os._exit(7)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 """
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], timeout=120, check=True)
-
-
-def test_nothing_is_written_to_the_terminal(tmp_path):
-    code = (
-        "import torch; from torch_backend.raster import rasterize as r; e=torch.eye(4)[None]; "
-        "r(torch.tensor([[0.,0.,2.]]), torch.ones(1,4), torch.zeros(1,3), torch.zeros(1), torch.ones(1,1), "
-        "viewmats=e, Ks=e[:,:3,:3], width=3, height=2)"
-    )
-    env = {**os.environ, "WARP_CACHE_PATH": str(tmp_path)}
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, timeout=300, check=True)
-    assert run.stdout == ""
-    assert run.stderr == ""
-    assert list(tmp_path.iterdir()), "the kernels were compiled elsewhere"
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert run.stdout == run.stderr == ""

@@ -1,4 +1,4 @@
-"""The CUDA implementation compiles for every supported GPU generation, also on machines without a GPU."""
+"""The CUDA implementation compiles for the oldest and the newest GPU generation, also on machines without a GPU."""
 
 import re
 
@@ -7,13 +7,13 @@ import pytest
 from torch_backend.native import initialised_warp
 from torch_backend.raster import cuda, cuda_source
 
-ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
+ARCHITECTURES = (75, 120)
 MODULES = {cuda.module_name("raster_project"): [(name, 0) for name in cuda_source.stages()]}
 MODULES |= {cuda.module_name(name, c): [(name, c)] for c in (3, 22) for name in cuda_source.blending(c)}
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_kernels_compile_for_every_architecture(module, tmp_path, capfd):
+def test_kernels_compile_without_local_memory(module, tmp_path, capfd):
     wp = initialised_warp()
     for name, channels in MODULES[module]:
         cuda.build(name, channels)
@@ -29,12 +29,11 @@ def test_kernels_compile_for_every_architecture(module, tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("arch", [75, 120])
-def test_machine_code_is_compiled(arch, tmp_path):
+def test_machine_code_is_compiled(tmp_path):
     name = "raster_blend_backward"
     cuda.build(name, 3)
     (path,) = initialised_warp().compile_aot_module(
-        cuda.module_name(name, 3), arch=arch, module_dir=tmp_path, use_ptx=False
+        cuda.module_name(name, 3), arch=75, module_dir=tmp_path, use_ptx=False
     )
     code = path.read_bytes()
     assert code[:4] == b"\x7fELF"

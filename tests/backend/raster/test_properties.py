@@ -1,7 +1,7 @@
 """Properties that hold for every input, on generated inputs. SPLANNEQUIN_CASES=20000 sets the cases per property.
 
 Examples are derandomised (tests/conftest.py): every run tests the same ones. The CUDA implementation gets few cases on
-CPU fibers, which are slow.
+CPU fibers, which are slow. The reference is compared with the other implementations only.
 """
 
 import dataclasses
@@ -19,16 +19,16 @@ from torch_backend.raster import RasterSettings
 from torch_backend.raster.constants import ALPHA_MIN
 
 REQUESTED_CASES = int(os.environ.get("SPLANNEQUIN_CASES", "0"))
-SHARE = {"cpu": 1.0, "reference": 0.25, "reference32": 0.25, "cuda": 0.05, "gpu": 0.5}
+SHARE = {"cpu": 1.0, "cuda": 0.1, "gpu": 0.5}
 """Cases per implementation relative to the CPU's, by speed."""
 
 
 def for_all(strategy, usual):
-    """Decorator of `holds(example, body)`: a test of every implementation, with `usual` (or SPLANNEQUIN_CASES) examples
-    times the implementation's share."""
+    """Decorator of `holds(example, body)`: a test of every compiled implementation, with `usual` (or SPLANNEQUIN_CASES)
+    examples times the implementation's share."""
 
     def decorate(holds):
-        @pytest.mark.parametrize("body", BODIES)
+        @pytest.mark.parametrize("body", [body for body in BODIES if body in SHARE])
         def test(body, generated):
             @settings(
                 max_examples=max(5, round(SHARE[body] * (REQUESTED_CASES or usual))),
@@ -55,34 +55,10 @@ ANY = st.one_of(
 )
 UNIT = st.floats(-1, 1, width=32)
 IN_VIEW = [
-    0.0,
-    0.0,
-    2.0,
-    0.3,
-    0.2,
-    3.0,
-    1.0,
-    0.0,
-    0.0,
-    0.0,
-    1.0,
-    0.2,
-    0.1,
-    0.3,
-    -1.0,
-    -1.0,
-    -1.0,
-    -1.0,
-    -1.5,
-    -1.0,
-    1.0,
-    0.0,
-    0.8,
-    0.4,
-    0.2,
-    0.1,
-    0.5,
-    0.9,
+    *(0.0, 0.0, 2.0, 0.3, 0.2, 3.0),
+    *(1.0, 0.0, 0.0, 0.0, 1.0, 0.2, 0.1, 0.3),
+    *(-1.0, -1.0, -1.0, -1.0, -1.5, -1.0),
+    *(1.0, 0.0, 0.8, 0.4, 0.2, 0.1, 0.5, 0.9),
 ]
 """Means, quaternions, log-scales, opacity logits and colours of two Gaussians."""
 SIZES = st.sampled_from([(1, 1), (7, 5), (16, 16), (17, 3), (20, 18), (1, 33)])
@@ -122,7 +98,7 @@ def gaussians(draw):
 
 
 VIEWS = st.sampled_from([1, 1, 1, 2, 0])
-BANDS = st.sampled_from([(None, 3), (None, 1), (0, 3), (1, 4), (2, 3)])
+BANDS = st.sampled_from([(None, 3), (0, 3), (1, 4), (2, 3)])
 """(degree of the harmonics, number of channels)."""
 KINDS = gaussians()
 
@@ -239,7 +215,7 @@ NUMBERS = st.one_of(PATCHED, st.lists(ANY, min_size=28, max_size=28))
 """Two Gaussians in view with up to four numbers replaced by arbitrary ones; or only arbitrary numbers."""
 
 
-@for_all(st.tuples(NUMBERS, st.sampled_from([None, 0, 1]), st.booleans()), 200)
+@for_all(st.tuples(NUMBERS, st.sampled_from([None, 0, 1]), st.booleans()), 80)
 def test_any_numbers_give_sane_images_and_gradients(example, body):
     values, degree, antialiased = example
     flat = torch.tensor(values, dtype=torch.float64)
@@ -273,7 +249,7 @@ def test_any_numbers_give_sane_images_and_gradients(example, body):
         assert torch.isfinite(leaf.grad).all() or color.nan_to_num().abs().max() > 1e6, name
 
 
-@for_all(scenes(), 250)
+@for_all(scenes(), 80)
 def test_bodies_agree_with_the_reference_on_any_scene(scene, body):
     errors = compare(scene, body)
     assert_sane(scene, errors.out, errors.grads)
@@ -282,7 +258,7 @@ def test_bodies_agree_with_the_reference_on_any_scene(scene, body):
     assert errors.image <= 2e-3
 
 
-@for_all(good_scenes(), 250)
+@for_all(good_scenes(), 80)
 def test_gradients_agree_with_the_reference_on_good_scenes(scene, body):
     errors = compare(scene, body)
     assert errors.image <= 5e-4
@@ -291,7 +267,7 @@ def test_gradients_agree_with_the_reference_on_good_scenes(scene, body):
         assert difference <= 2e-3 * truth.norm() + 1e-3, name
 
 
-@for_all(st.tuples(good_scenes(), st.integers(0, 1000)), 150)
+@for_all(st.tuples(good_scenes(), st.integers(0, 1000)), 50)
 def test_order_of_the_gaussians_changes_nothing(example, body):
     scene, seed = example
     order = torch.randperm(len(scene.tensors["means"]), generator=torch.Generator().manual_seed(seed))
@@ -312,7 +288,7 @@ FLAT = good_scenes(bands=st.sampled_from([(None, 3), (0, 3)]))
 TURNS = st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT)
 
 
-@for_all(st.tuples(FLAT, TURNS, st.tuples(UNIT, UNIT, UNIT)), 150)
+@for_all(st.tuples(FLAT, TURNS, st.tuples(UNIT, UNIT, UNIT)), 50)
 def test_moving_the_world_and_the_camera_together_changes_nothing(example, body):
     scene, turn, shift = example
     turned = Rotation.from_quat(turn, scalar_first=True)
@@ -327,7 +303,7 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(example, body)
     assert_alike(scene.run(body), second, len(quats))
 
 
-@for_all(st.tuples(good_scenes(), st.floats(-5, 5)), 150)
+@for_all(st.tuples(good_scenes(), st.floats(-5, 5)), 50)
 def test_scaling_the_world_scales_the_depth(example, body):
     scene, exponent = example
     factor = 10.0**exponent
@@ -347,7 +323,7 @@ def test_scaling_the_world_scales_the_depth(example, body):
     assert torch.allclose(first.depth_expected[solid] * factor, second.depth_expected[solid], rtol=5e-3)
 
 
-@for_all(good_scenes(sizes=st.just((34, 20)), points=st.just((0.5, 0.5))), 150)
+@for_all(good_scenes(sizes=st.just((34, 20)), points=st.just((0.5, 0.5))), 50)
 def test_two_halves_make_the_image(scene, body):
     # Tiles and principal point change. Means are near the centre, so that no half clamps a Jacobian.
     scene.tensors["means"][:, 0] *= 0.25
@@ -377,7 +353,7 @@ def fans(draw):
 FANS = scenes(least=1, most=1, kind=fans(), views=st.just(1), points=st.sampled_from([(0.5, 0.5), (0.1, 0.8)]))
 
 
-@for_all(FANS, 250)
+@for_all(FANS, 80)
 def test_footprints_at_the_frustum_edge_are_bounded(scene, body):
     # sigma^2 <= |J|^2 s^2 + 0.3 with clamped x/z and y/z in J; the ellipse ends at most at sqrt(2 ln 255) sigma.
     out, grads = run(scene, body)

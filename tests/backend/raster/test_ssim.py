@@ -55,7 +55,7 @@ on_every_body = pytest.mark.parametrize(
 
 @on_every_body
 @pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize(("height", "width"), [(11, 11), (17, 23), (13, 200), (90, 12), (13, 640), (640, 13), (48, 64)])
+@pytest.mark.parametrize(("height", "width"), [(11, 11), (17, 23), (13, 640), (640, 13)])
 def test_value_and_gradient_match_float64(body, height, width, channels):
     image, target = pair(height, width, channels)
     score, _, device = BODIES[body]
@@ -69,7 +69,7 @@ def test_value_and_gradient_match_float64(body, height, width, channels):
 
 @on_every_body
 @pytest.mark.parametrize("hides", [False, True])
-@pytest.mark.parametrize(("height", "width"), [(11, 11), (37, 23), (13, 640), (640, 13)])
+@pytest.mark.parametrize(("height", "width"), [(11, 11), (13, 640), (640, 13)])
 def test_the_loss_and_its_gradient_match_float64(body, height, width, hides):
     image, target = pair(height, width, 3)
     image[3, 4] = target[3, 4]  # here the slope of |x - y| is 0
