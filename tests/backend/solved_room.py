@@ -18,7 +18,7 @@ from torch_backend.shot import Shot
 
 WIDTH, HEIGHT = 320, 240
 FOCAL, RADIAL = 300.0, -0.06
-COUNT = 21
+COUNT = 15
 STEP = 2
 
 
@@ -40,7 +40,7 @@ class Room:
         x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
         distorted = np.stack([(x - K[2]) / K[0], (y - K[3]) / K[1]], axis=-1)
         ideal = distorted.copy()
-        for _ in range(30):  # fixed-point iteration of distorted = ideal (1 + k |ideal|^2)
+        for _ in range(15):  # fixed-point iteration of distorted = ideal (1 + k |ideal|^2)
             ideal = distorted / (1.0 + radial * (ideal**2).sum(-1, keepdims=True))
         return self.cast(viewmat, np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1))
 
@@ -93,7 +93,7 @@ def look(position, yaw=0.0, pitch=0.0):
     return viewmat
 
 
-def handheld(count=COUNT):
+def handheld(count):
     """[count] world-to-camera poses of a sideways step with some sway."""
     poses = []
     for t in np.linspace(0.0, 1.0, count):
@@ -131,26 +131,30 @@ class Solved:
 
 @pytest.fixture(scope="session")
 def solved(tmp_path_factory):
-    """Clip of 21 frames, every second one solved."""
+    """Clip of 15 frames, every second one solved."""
     folder = tmp_path_factory.mktemp("room")
-    poses = handheld()
+    poses = handheld(COUNT)
     clip = write_clip(folder, poses)
     shot, report = Shot.create(folder / "room.splannequin"), Quiet()
     import_footage(shot, str(clip), FootageConfig(step=STEP), report)
     return Solved(shot, poses, solve_all(shot, SolveConfig(features=1500), report), report)
 
 
-@pytest.fixture
-def again(solved, tmp_path):
+def to_solve_again(solved, folder):
     """Copy of the solved shot, and its COLMAP model. A solve from this model is faster than one from the pictures.
 
     Its frames are still distorted, as if another lens had been used.
     """
-    shutil.copytree(solved.shot.solve / "colmap", tmp_path / "model")
-    shot = Shot(shutil.copytree(solved.shot.root, tmp_path / "a.splannequin"))
+    shutil.copytree(solved.shot.solve / "colmap", folder / "model")
+    shot = Shot(shutil.copytree(solved.shot.root, folder / "a.splannequin"))
     for raw in (shot.frames / "raw").iterdir():
         shutil.copy(raw, shot.frames)
-    return shot, str(tmp_path / "model")
+    return shot, str(folder / "model")
+
+
+@pytest.fixture
+def again(solved, tmp_path):
+    return to_solve_again(solved, tmp_path)
 
 
 @pytest.fixture(scope="session")

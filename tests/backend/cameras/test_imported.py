@@ -104,7 +104,7 @@ def test_colmap_lenses(model, params, expected):
     assert (lens.model, lens.params) == expected
 
 
-def test_an_ordinary_lens_bends_as_colmap_says(solved, tmp_path):
+def test_an_ordinary_lens_bends_as_colmap_says():
     """SIMPLE_RADIAL and the converted model project to the same pixels in COLMAP, which runs in a separate process."""
     import subprocess
     import sys
@@ -125,7 +125,7 @@ def test_a_colmap_model_reads_as_pycolmap_wrote_it(solved):
     solve = imported.read(solved.shot.solve / "colmap")
     path = {f.frame: f for f in CameraPath.load(solved.shot.solve / "cameras.json").frames}
     numbers = [int(c.name.rpartition(".")[0]) for c in solve.cameras]
-    assert sorted(numbers) == list(range(101, 122, 2))
+    assert sorted(numbers) == list(range(101, 116, 2))
     for number, camera in zip(numbers, solve.cameras, strict=True):
         np.testing.assert_allclose(camera.pose, np.reshape(path[number].viewmat, (4, 4))[:3], atol=1e-9)
     record = read_json(solved.shot.solve / "solve.json")
@@ -149,11 +149,11 @@ def test_a_model_written_is_the_model_read(solved, tmp_path, text):
     np.testing.assert_array_equal(again.points.error, model.points.error)
 
 
-@pytest.mark.parametrize("below", ["", "sparse", "sparse/0"])
+@pytest.mark.parametrize("below", ["sparse", "sparse/0"])
 def test_the_model_is_found_below(solved, tmp_path, below):
     write_model(tmp_path / below, read_model(solved.shot.solve / "colmap"))
-    assert len(imported.read(tmp_path).cameras) == 11
-    assert len(imported.read(tmp_path / below / "cameras.bin").cameras) == 11
+    assert len(imported.read(tmp_path).cameras) == 8
+    assert len(imported.read(tmp_path / below / "cameras.bin").cameras) == 8
 
 
 def test_broken_files_are_a_sentence(solved, tmp_path):

@@ -15,7 +15,7 @@ from torch_backend.sfm.solving import SolveConfig, solve_shot
 from torch_backend.sfm.verdict import Fault
 from torch_backend.shot import Shot
 
-WIDTH, HEIGHT, COUNT = 320, 240, 10
+WIDTH, HEIGHT, COUNT = 320, 240, 8
 TRUTH = Lens(WIDTH, HEIGHT, (220.0, 220.0), (220.0, 220.0), (WIDTH / 2, HEIGHT / 2), -0.16)
 
 
@@ -45,7 +45,7 @@ def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
     """
     shot, poses, folder = clip
     config = SolveConfig(
-        features=1200,
+        features=1000,
         st_map=str(folder / "redistort.exr"),
         st_map_way="redistort",
         ignore_mask=MASK_FOUND,
@@ -74,10 +74,10 @@ def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
     centres = [np.array([-p[:3, :3].T @ p[:3, 3] for p in group]) for group in (solved, np.array(poses))]
     mean = [c.mean(0) for c in centres]
     size = np.linalg.norm(centres[0] - mean[0]) / np.linalg.norm(centres[1] - mean[1])
-    for n in (0, 4, 9):
+    for n in (0, 4, 7):
         rays = np.concatenate([(TRUTH.to_plate(at) - TRUTH.centre) / 220.0, np.ones((9, 1))], 1)
         seen = rays * 3.0  # camera axes of frame n, metres
-        neighbours = [k for k in (0, 4, 9) if k != n]
+        neighbours = [k for k in (0, 4, 7) if k != n]
         for k in neighbours:
             true = between(poses[n], poses[k], seen)
             mine = between(solved[n], solved[k], seen * size)
@@ -102,7 +102,7 @@ def between(one, two, points):
 def test_a_map_the_wrong_way_round_is_noticed(clip, tools, tmp_path):
     shot, _, folder = clip
     report = tools.recorder()
-    config = SolveConfig(features=800, st_map=str(folder / "redistort.exr"), retry=False)
+    config = SolveConfig(features=500, st_map=str(folder / "redistort.exr"), retry=False)
     solve_shot(Shot(shot.root), config, report)
     assert [w for w in report.warnings if "The ST map does not straighten the frames: they are still bent by" in w]
 

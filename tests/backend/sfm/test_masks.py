@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.backend.solved_room import solve_all
 from torch_backend.contract import CameraPath, JobError, read_json
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.masks import Mask
-from torch_backend.motion.mattes import MOVING, STILL, UNKNOWN, load_motion
+from torch_backend.motion.mattes import MOVING, STILL, UNKNOWN
 from torch_backend.replacing import replacing_solve
 from torch_backend.sfm.masks import (
     IGNORE,
@@ -26,7 +25,7 @@ from torch_backend.sfm.masks import (
 from torch_backend.sfm.solving import SolveConfig, _matching, solve_shot
 from torch_backend.shot import Shot
 
-COUNT, FEATURES = 11, 1500
+COUNT, FEATURES = 9, 1000
 
 
 def board(n):
@@ -51,7 +50,7 @@ def masked(tmp_path_factory, tools):
         write_png(folder / "mask" / f"m.{101 + n}.png", np.where(on[..., None], np.uint8(255), np.uint8([0, 0, 0])))
     shot, report = Shot.create(folder / "room.splannequin"), tools.recorder()
     import_footage(shot, str(clip), FootageConfig(step=1), report)
-    solve_all(shot, config(folder / "mask"), report)
+    solve_shot(shot, config(folder / "mask"), report)
     return shot, poses, folder / "mask"
 
 
@@ -76,7 +75,7 @@ def test_the_mask_lies_over_the_undistorted_frames_as_over_the_filmed_ones(maske
     shot, *_ = masked
     lens = read_json(shot.solve_record)["lenses"][0]["params"]
     focal, cx, cy, k = lens[0], *lens[1:4]
-    for n in (0, 5, 10):
+    for n in (0, 4, 8):
         camera = CameraPath.from_json(read_json(shot.cameras)).frames[n].K
         x, y = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
         u, v = (x - camera[2]) / camera[0], (y - camera[3]) / camera[1]
@@ -86,16 +85,6 @@ def test_the_mask_lies_over_the_undistorted_frames_as_over_the_filmed_ones(maske
         found = load_mask(shot, PEOPLE, 101 + n)
         assert (found != wanted).mean() < 0.002 and wanted.mean() > 0.2
         assert load_mask(shot, IGNORE, 101 + n) is None
-
-
-def test_nothing_moves_outside_of_the_mask(masked):
-    shot, *_ = masked
-    moving = 0
-    for n in range(COUNT):
-        labels, people = load_motion(shot, 101 + n), load_mask(shot, PEOPLE, 101 + n)
-        assert (labels[~people] == STILL).all()
-        moving += np.count_nonzero(labels == MOVING)
-    assert moving > 0
 
 
 def test_solve_key_depends_on_mask_content_not_path(masked, tmp_path, tools):

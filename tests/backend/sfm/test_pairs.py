@@ -12,62 +12,54 @@ import pytest
 from torch_backend.contract import REQUEST_FILE, child_environment
 
 MATCH = """
-import sys
+import shutil, sys
 from pathlib import Path
 from torch_backend.sfm import pairs
 from torch_backend.sfm.matching import extract, match
 from torch_backend.sfm.request import Request
 
-request, least, python = Request(Path(sys.argv[1])), int(sys.argv[2]), sys.argv[3]
-pairs.LEAST_PAIRS, sys.executable = least, python
-if not request.database.is_file():
-    extract(request, request.solved, None)
-match(request)
+one, several, broken = (Path(folder) / "request.json" for folder in sys.argv[1:4])
+extract(Request(one), Request(one).solved, None)
+for file in (several, broken):
+    shutil.copytree(one.parent, file.parent)
+for file, least, python in ((one, 1000, sys.executable), (several, 5, sys.executable), (broken, 5, sys.argv[4])):
+    pairs.LEAST_PAIRS, sys.executable = least, python
+    match(Request(file))
 """
 
 
-def matched(folder: Path, least: int, python: str = sys.executable) -> list:
-    """All matches in the database after `folder`'s request was processed, with at least `least` pairs per process."""
-    command = [sys.executable, "-P", "-c", MATCH, str(folder / REQUEST_FILE), str(least), python]
-    root = Path(__file__).resolve().parents[3]
-    subprocess.run(command, env=child_environment(root), check=True, stdout=subprocess.DEVNULL)
-    assert not [path for path in folder.iterdir() if path.is_dir()], "what helpers wrote is gone"
-    with sqlite3.connect(folder / "database.db") as database:
+@pytest.fixture(scope="module")
+def databases(solved, tmp_path_factory):
+    """Contents of the databases of one process, of several, and of several that break."""
+    root = tmp_path_factory.mktemp("pairs")
+    folders = [root / name for name in ("one", "several", "broken")]
+    names = sorted(path.name for path in solved.shot.raw.glob("*.png"))[:8]
+    request = {
+        "images": str(solved.shot.raw), "solved": names, "others": [], "camera_model": "SIMPLE_RADIAL", "overlap": 15,
+        "features": 300, "neighbours": 2, "threads": 3,
+    }  # fmt: skip
+    folders[0].mkdir()
+    (folders[0] / REQUEST_FILE).write_text(json.dumps(request))
+    command = [sys.executable, "-P", "-c", MATCH, *map(str, folders), shutil.which("false") or "false"]
+    subprocess.run(
+        command, env=child_environment(Path(__file__).resolve().parents[3]), check=True, stdout=subprocess.DEVNULL
+    )
+    assert not [path for folder in folders for path in folder.iterdir() if path.is_dir()], "what helpers wrote is gone"
+    return [contents(folder / "database.db") for folder in folders]
+
+
+def contents(file: Path) -> list:
+    with sqlite3.connect(file) as database:
         tables = "select * from matches", "select * from two_view_geometries", "select * from images"
         return [sorted(database.execute(rows)) for rows in tables]
 
 
-@pytest.fixture(scope="module")
-def one_process(solved, tmp_path_factory):
-    """(folder with a request, database contents of one process)."""
-    folder = tmp_path_factory.mktemp("alone")
-    names = sorted(path.name for path in solved.shot.raw.glob("*.png"))[:8]
-    request = {
-        "images": str(solved.shot.raw), "solved": names, "others": [], "camera_model": "SIMPLE_RADIAL", "overlap": 15,
-        "features": 500, "neighbours": 2, "threads": 3,
-    }  # fmt: skip
-    (folder / REQUEST_FILE).write_text(json.dumps(request))
-    return folder, matched(folder, least=1000)
+def test_several_processes_leave_the_same_database(databases):
+    one, several, _ = databases
+    assert len(one[0]) == 7 + 6 + 4, "1, 2 and 4 frames apart"
+    assert several == one
 
 
-def unmatched(folder: Path, into: Path) -> Path:
-    """Copy of a folder whose database has only features."""
-    shutil.copytree(folder, into)
-    with sqlite3.connect(into / "database.db") as database:
-        database.execute("delete from matches")
-        database.execute("delete from two_view_geometries")
-    return into
-
-
-def test_several_processes_leave_the_same_database(one_process, tmp_path):
-    folder, expected = one_process
-    assert len(expected[0]) == 7 + 6 + 4, "1, 2 and 4 frames apart"
-    assert matched(unmatched(folder, tmp_path / "three"), least=5) == expected
-
-
-def test_the_pairs_of_a_process_that_breaks_are_matched_all_the_same(one_process, tmp_path):
-    folder, expected = one_process
-    broken = shutil.which("false")
-    if broken is None:
-        pytest.skip("no program that always fails")
-    assert matched(unmatched(folder, tmp_path / "broken"), 5, broken) == expected
+@pytest.mark.skipif(shutil.which("false") is None, reason="no program that always fails")
+def test_the_pairs_of_a_process_that_breaks_are_matched_all_the_same(databases):
+    assert databases[2] == databases[0]

@@ -5,10 +5,12 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from tests.backend.solved_room import to_solve_again
 from torch_backend.cameras.stored import load_points
 from torch_backend.contract import CameraPath, Cancelled
 from torch_backend.scene import load_scene
@@ -16,6 +18,7 @@ from torch_backend.sfm.solving import SolveConfig, solve_shot
 from torch_backend.shot import Shot
 
 ROOT = Path(__file__).resolve().parents[3]
+STALE = "colmap/rigs.bin", "stmap_undistort.exr", "stmap_redistort.exr"
 AGAIN = """
 import os, signal, sys
 from torch_backend.contract import Reporter
@@ -61,60 +64,56 @@ def killed(shot, cameras, stage="", rename=0):
     assert done.returncode == -signal.SIGKILL
 
 
-def test_a_cancelled_solve_leaves_the_one_before_it(again, tools):
-    shot, cameras = again
-    before = contents(shot)
-    for stage in ("solve: lens", "solve: undistort"):
-        with pytest.raises(Cancelled):
-            solve_shot(shot, SolveConfig(), tools.recorder(cancel_at=(stage, 0.0)), cameras)
-        assert contents(shot) == before
+@dataclass
+class Replaced:
+    """A shot with stale files of the solve before, and a whole new solve of it."""
+
+    before: dict
+    cancelled: dict
+    """After a new solve that was cancelled."""
+    after: dict
+    shot: Shot
+    warnings: list
 
 
-def test_a_solve_killed_while_it_writes_leaves_the_one_before_it(again, tools):
+@pytest.fixture(scope="module")
+def replaced(solved, tools, tmp_path_factory):
+    shot, cameras = to_solve_again(solved, tmp_path_factory.mktemp("replaced"))
+    for name in STALE:
+        (shot.solve / name).write_bytes(b"of a solve of before")
+    before, report = contents(shot), tools.recorder()
+    with pytest.raises(Cancelled):
+        solve_shot(shot, SolveConfig(), tools.recorder(cancel_at=("solve: undistort", 0.0)), cameras)
+    cancelled = contents(shot)
+    solve_shot(shot, SolveConfig(), report, cameras)
+    return Replaced(before, cancelled, contents(shot), shot, report.warnings)
+
+
+def test_a_cancelled_solve_leaves_the_one_before_it(replaced):
+    assert replaced.cancelled == replaced.before and {f"solve/{name}" for name in STALE} <= set(replaced.before)
+
+
+def test_a_new_solve_leaves_none_of_the_files_of_the_one_before_it(replaced):
+    """ST maps were for the lens before. That they go is said."""
+    solve = replaced.shot.solve
+    assert {p.name for p in (solve / "colmap").iterdir()} == {"cameras.bin", "images.bin", "points3D.bin"}
+    assert not any((solve / name).exists() for name in STALE)
+    assert "The ST maps of the previous solve were for its lens and have been removed." in replaced.warnings
+
+
+def test_a_killed_solve_leaves_the_one_before_it_or_is_whole_when_the_shot_is_opened_next(again, replaced):
+    """It is killed while it writes, and, started again, while its files take their places: the cameras last."""
     shot, cameras = again
     before = contents(shot)
     killed(shot, cameras, stage="solve: undistort")
     assert of_old(Shot.open(shot.root), before)
-    assert len(load_scene(shot).solved) == 11
-    solve_shot(shot, SolveConfig(), tools.recorder(), cameras)
-    assert not list(shot.solve.glob("next*")) and not (shot.solve / "scratch").exists()
-
-
-@pytest.mark.parametrize("rename", [9, 26])
-def test_a_solve_killed_while_it_takes_its_place_is_whole_when_the_shot_is_opened_next(again, tools, rename):
-    shot, cameras = again
-    whole = Shot(shutil.copytree(shot.root, shot.root.with_name("whole.splannequin")))
-    solve_shot(whole, SolveConfig(), tools.recorder(), cameras)
-    before = contents(shot)
-    killed(shot, cameras, rename=rename)
-    assert not of_old(shot, before)
-    assert contents(Shot.open(shot.root)) == contents(whole) != before
-    path = CameraPath.load(shot.solve / "cameras.json")
-    assert len(path.frames) == 21 and len(load_points(shot)["xyz"]) > 300
-
-
-def test_a_model_of_fewer_files_leaves_none_of_the_one_before_it(again, tools):
-    shot, cameras = again
-    (shot.solve / "colmap" / "rigs.bin").write_bytes(b"of a solve of before")
-    solve_shot(shot, SolveConfig(), tools.recorder(), cameras)
-    assert {p.name for p in (shot.solve / "colmap").iterdir()} == {"cameras.bin", "images.bin", "points3D.bin"}
-
-
-def test_st_maps_of_the_lens_before_go_and_that_is_said(again, tools):
-    shot, cameras = again
-    maps = [shot.solve / name for name in ("stmap_undistort.exr", "stmap_redistort.exr")]
-    for path in maps:
-        path.write_bytes(b"of a solve of before")
-    with pytest.raises(Cancelled):
-        solve_shot(shot, SolveConfig(), tools.recorder(cancel_at=("solve: undistort", 0.0)), cameras)
-    assert all(path.is_file() for path in maps)
-    report = tools.recorder()
-    solve_shot(shot, SolveConfig(), report, cameras)
-    assert not any(path.exists() for path in maps)
-    assert "The ST maps of the previous solve were for its lens and have been removed." in report.warnings
-    report = tools.recorder()
-    solve_shot(shot, SolveConfig(), report, cameras)
-    assert not any("ST maps" in warning for warning in report.warnings)
+    assert len(load_scene(shot).solved) == 8
+    killed(shot, cameras, rename=20)
+    assert not of_old(shot, before) and shot.cameras.read_bytes() != (replaced.shot.cameras).read_bytes()
+    assert contents(Shot.open(shot.root)) == replaced.after != before
+    assert not list(shot.solve.glob("next*"))
+    path = CameraPath.load(shot.cameras)
+    assert len(path.frames) == 15 and len(load_points(shot)["xyz"]) > 300
 
 
 @pytest.mark.parametrize("linked", ["frames", "solve/colmap", "solve/next", "solve/next/frames", "takes"])

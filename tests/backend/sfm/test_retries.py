@@ -116,16 +116,29 @@ def test_of_two_tries_that_came_to_the_same_the_first_keeps_its_files(tmp_path, 
 def fog(tmp_path_factory, tools):
     """The room through fog at 6 % contrast: COLMAP's default threshold finds no features."""
     folder = tmp_path_factory.mktemp("fog")
-    clip = tools.write_clip(folder, tools.handheld(10), noise=0.3, contrast=0.06)
+    clip = tools.write_clip(folder, tools.handheld(8), noise=0.3, contrast=0.06)
     shot = Shot.create(folder / "fog.splannequin")
     import_footage(shot, str(clip), FootageConfig(step=1), tools.recorder())
     return shot
 
 
+def test_cancelling_ends_the_tries_and_leaves_nothing_half_done(fog, tools):
+    class Impatient(tools.recorder):
+        def warning(self, message, hint=""):
+            super().warning(message, hint)
+            self.cancelled = True
+
+    report = Impatient()
+    with pytest.raises(Cancelled):
+        solve_shot(fog, SolveConfig(features=1000), report)
+    assert len(report.warnings) == 1 and {p.name for p in fog.solve.iterdir()} == {"colmap.log"}
+    assert not list(fog.frames.glob("*.png"))
+
+
 def test_a_clip_that_the_first_try_cannot_take_is_solved_with_more_features_and_that_is_said(fog, tools):
     report = tools.recorder()
     result = solve_shot(fog, SolveConfig(features=1000), report)
-    assert result["registered"] == 10
+    assert result["registered"] == 8
     record = read_json(fog.solve_record)
     assert record["rung"] == "features" and [attempt_record["rung"] for attempt_record in record["tries"]] == [
         "first",
@@ -139,25 +152,6 @@ def test_a_clip_that_the_first_try_cannot_take_is_solved_with_more_features_and_
     assert not (fog.solve / "scratch").exists() and (fog.solve / "colmap.log").stat().st_size
 
 
-def test_without_retrying_it_is_refused_for_what_it_is(fog, tools):
-    report = tools.recorder()
-    with pytest.raises(JobError, match="^The frames show too little to match: a frame has about ") as error:
-        solve_shot(fog, SolveConfig(features=1000, retry=False), report)
-    assert report.warnings == [] and "Tried" not in error.value.hint and "more light and texture" in error.value.hint
-
-
-def test_cancelling_ends_the_tries(fog, tools):
-    class Impatient(tools.recorder):
-        def warning(self, message, hint=""):
-            super().warning(message, hint)
-            self.cancelled = True
-
-    report = Impatient()
-    with pytest.raises(Cancelled):
-        solve_shot(fog, SolveConfig(features=999), report)
-    assert len(report.warnings) == 1 and not (fog.solve / "scratch").exists()
-
-
 def test_switching_it_on_again_solves_again_and_solves_of_before_stay():
     config = SolveConfig(features=1000)
     frames = {"key": "frames"}
@@ -168,8 +162,9 @@ def test_switching_it_on_again_solves_again_and_solves_of_before_stay():
 def test_a_fisheye_that_was_taken_for_an_ordinary_lens_is_solved_as_one(tmp_path, tools):
     focal = 160.0
     rays = tools.fisheye_rays(focal, 0.02)
-    pictures = [tools.room().cast(pose, rays) for pose in tools.handheld(9)]
-    request, frames = tools.request_for(tmp_path, pictures)
+    poses = tools.handheld(9)
+    pictures = [tools.room().cast(pose, rays) for pose in poses]
+    request, frames = tools.request_for(tmp_path, pictures, features=500)
     report = tools.recorder()
     best = solve_with_retries(request, frames, True, tmp_path, tmp_path / "log.txt", report).best
     assert (best.strategy, best.fault) == ("lens", None)
@@ -180,6 +175,13 @@ def test_a_fisheye_that_was_taken_for_an_ordinary_lens_is_solved_as_one(tmp_path
         "Trying again with a fisheye lens (OPENCV_FISHEYE)."
     ]
     assert {p.name for p in (tmp_path / "first").iterdir()} <= {"database.db"}
+    lens = best.answer["result"]["lens"]
+    assert lens["view_deg"] == pytest.approx(112.0, abs=4.0) and not lens["doubt"]
+    found = read_json(best.folder / "poses.json")
+    turns = [np.array(found[name]["pose"])[:, :3] for name in request["solved"]]
+    for a, b, true_a, true_b in zip(turns, turns[1:], poses, poses[1:]):
+        between = (b @ a.T) @ (true_b[:3, :3] @ true_a[:3, :3].T).T
+        assert np.degrees(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1))) < 0.2
 
 
 def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path, tools):
@@ -204,8 +206,8 @@ def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path
 
 
 def test_the_global_mapper_and_wider_pairs_find_the_room_as_well(tmp_path, tools):
-    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(10)]
-    request, frames = tools.request_for(tmp_path, pictures, mapper="global", wide=True)
+    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(8)]
+    request, frames = tools.request_for(tmp_path, pictures, mapper="global", wide=True, features=400)
     answer = solve_with_retries(request, frames, False, tmp_path, tmp_path / "log.txt", tools.recorder()).best.answer
-    assert fault_of(answer, frames) is None and answer["result"]["registered"] == 10
+    assert fault_of(answer, frames) is None and answer["result"]["registered"] == 8
     assert answer["result"]["focal_px"] == pytest.approx(300.0, rel=0.02)
