@@ -10,7 +10,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--program-faults", type=int, default=3, help="of solve, farm, launcher, Blender (3 in CI, 40 nightly)"
     )
     group.addoption("--faults-from", type=int, default=0, help="number of the first case: repeats one with --faults 1")
-    group.addoption("--fuzz", type=int, default=200, help="mutated files per parser (200 in CI)")
+    group.addoption("--fuzz", type=int, default=60, help="mutated files per parser (60 in CI)")
     group.addoption("--seed", type=int, default=65, help="seed of faults and mutations")
 
 

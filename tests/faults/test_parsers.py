@@ -322,7 +322,7 @@ def test_mutated_files_are_read_or_refused(name: str, valid: Path, request: pyte
     found: dict[str, int] = {}
     try:
         with bounded():
-            for number in range(max(1, int(option("--fuzz", 200) * parser.share))):
+            for number in range(max(1, int(option("--fuzz", 60) * parser.share))):
                 path.write_bytes(mutated(whole, random.Random(f"{option('--seed', 65)}-{name}-{number}")))
                 fault = fault_of(parser, valid, path)
                 if fault and len(found) < 10 and fault not in found:

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import hashlib
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -33,7 +34,7 @@ def write_wheel(tmp_path: Path):
         wheel = tmp_path / f"{name}-{version}-py3-none-any.whl"
         with zipfile.ZipFile(wheel, "w") as archive:
             for path, content in files.items():
-                archive.writestr(path, content)
+                archive.writestr(zipfile.ZipInfo(path), content)  # without a date: the same bytes each time
         return wheel
 
     return write
@@ -85,6 +86,24 @@ def start(folder: Path) -> None:
 def environment(bare_environment: environments.Environment) -> environments.Environment:
     """An environment of one small package, whose set-up was only begun."""
     start(bare_environment.folder)
+    return bare_environment
+
+
+@pytest.fixture(scope="session")
+def shelf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Place of the finished environment that `installed` copies."""
+    return tmp_path_factory.mktemp("installed") / ".venv"
+
+
+@pytest.fixture
+def installed(bare_environment: environments.Environment, shelf: Path) -> environments.Environment:
+    """A finished environment of one small package."""
+    if not shelf.exists():
+        start(bare_environment.folder)
+        environments.set_up(bare_environment, sys.executable)
+        shutil.copytree(bare_environment.folder, shelf, symlinks=True)
+    else:
+        shutil.copytree(shelf, bare_environment.folder, symlinks=True)
     return bare_environment
 
 

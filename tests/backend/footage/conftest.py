@@ -10,12 +10,12 @@ from scipy.ndimage import gaussian_filter
 from tests.backend.quiet import Quiet
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def recorder():
     return Quiet
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def pan():
     """pan(count, height, width, seed, speed): uint8 frames of a camera that pans over a random texture."""
 
@@ -30,7 +30,7 @@ def pan():
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def write_video():
     """write_video(path, frames, ...): writes a lossless H.264 file in YCbCr 4:4:4."""
 

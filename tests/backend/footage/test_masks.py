@@ -21,14 +21,15 @@ COVERED = np.zeros((48, 64), bool)
 COVERED[10:20, 30:50] = True
 
 
-@pytest.fixture
-def shot(tmp_path, pan, recorder):
-    """Shot of ten frames of 64 x 48, numbered 101 to 110."""
-    (tmp_path / "clip").mkdir()
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory, pan, recorder):
+    """Shot of ten frames of 64 x 48, numbered 101 to 110; tests must not change it."""
+    folder = tmp_path_factory.mktemp("shot")
+    (folder / "clip").mkdir()
     for number, pixels in zip(FRAMES, pan(10), strict=True):
-        write_png(tmp_path / "clip" / f"f.{number}.png", pixels)
-    new_shot = Shot.create(tmp_path / "a.splannequin")
-    import_footage(new_shot, str(tmp_path / "clip"), FootageConfig(), recorder())
+        write_png(folder / "clip" / f"f.{number}.png", pixels)
+    new_shot = Shot.create(folder / "a.splannequin")
+    import_footage(new_shot, str(folder / "clip"), FootageConfig(), recorder())
     return new_shot
 
 
