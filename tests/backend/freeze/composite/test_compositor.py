@@ -206,11 +206,6 @@ def ignore(shot, logo):
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory, quiet):
-    return build(tmp_path_factory.mktemp("board"), quiet())
-
-
-@pytest.fixture(scope="module")
 def still_world(tmp_path_factory, quiet):
     return build(tmp_path_factory.mktemp("still"), quiet(), still=True)
 
@@ -254,13 +249,11 @@ def assert_is_plate(frame, plate, where):
 def test_a_still_world_is_the_plate(still_world):
     plates, everywhere = still_world.plates(), np.ones((H, W), bool)
     assert (plates.width, plates.height) == (W, H)
-    for frame, t_star in ((3, 11), (7, 7)):
-        result = still_world.make(still_world.output(frame, t_star))
-        assert result.primary == frame
-        assert_is_plate(result, plates.linear(frame), everywhere)
-        np.testing.assert_allclose(result.color, plates.display(frame), atol=2e-6)
-        picture, _ = still_world.seen_at(frame)
-        assert np.abs(result.color.numpy() - picture).max() < 2e-5
+    result = still_world.make(still_world.output(3, 11))
+    assert result.primary == 3
+    assert_is_plate(result, plates.linear(3), everywhere)
+    np.testing.assert_allclose(result.color, plates.display(3), atol=2e-6)
+    assert np.abs(result.color.numpy() - still_world.seen_at(3)[0]).max() < 2e-5
 
 
 @pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (9, 4)])
@@ -270,7 +263,7 @@ def test_static_pixels_equal_the_plate(world, composited, frame, t_star):
     assert_is_plate(composited(frame, t_star), world.plates().linear(frame), where)
 
 
-@pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (9, 4), (12, 2), (2, 7)])
+@pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (9, 4)])
 def test_the_board_is_where_it_was_at_t_star_and_has_its_stripes(world, composited, frame, t_star):
     output, result = world.output(frame, t_star), composited(frame, t_star)
     truth, on = world.truth(output)
@@ -285,9 +278,9 @@ def test_the_board_is_where_it_was_at_t_star_and_has_its_stripes(world, composit
 
 
 def test_what_still_is_in_one_plate_only_differs_between_two_instants(world, composited):
-    early, late = composited(6, 2), composited(6, 11)
-    truths = [world.truth(world.output(6, t)) for t in (2, 11)]
-    touched = dilate(truths[0][1] | truths[1][1] | world.seen_at(6)[1], 16)
+    early, late = composited(9, 4), composited(9, 11)
+    truths = [world.truth(world.output(9, t)) for t in (4, 11)]
+    touched = dilate(truths[0][1] | truths[1][1] | world.seen_at(9)[1], 16)
     moved = np.abs(truths[0][0] - truths[1][0]).max(-1) > 0.15
     difference = (early.linear - late.linear).abs().numpy().max(-1)
     assert (difference[~touched] == 0).all() and (~touched).sum() > 20_000
@@ -311,12 +304,11 @@ def replace_pose(output, shift):
 
 
 def test_frame_at_t_star_equals_its_plate(world, composited):
-    for frame in (4, 11):
-        assert_is_plate(composited(frame, frame), world.plates().linear(frame), np.ones((H, W), bool))
-        assert composited(frame, frame).motion.numpy()[~dilate(~world.seen_at(frame)[1], 3)].min() > 0.9
+    assert_is_plate(composited(11, 11), world.plates().linear(11), np.ones((H, W), bool))
+    assert composited(11, 11).motion.numpy()[~dilate(~world.seen_at(11)[1], 3)].min() > 0.9
 
 
-@pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (10, 4)])
+@pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (9, 4)])
 def test_plate_may_be_used_where_the_motion_matte_is_black(world, composited, frame, t_star):
     """Where the board has left its place by t*, the matte must be white: the plate would show the board twice."""
     result = composited(frame, t_star)
@@ -360,7 +352,7 @@ def test_frame_plate_compensates_wrong_depth_far_from_t_star(tmp_path, quiet, mo
 def test_masked_logo_is_filled_from_other_plates(tmp_path, quiet):
     logo = np.zeros((H, W), bool)
     logo[150:170, 40:70] = True
-    world, plain = build(tmp_path, quiet(), still=True, logo=logo), tmp_path / "plain"
+    world = build(tmp_path, quiet(), still=True, logo=logo)
     output = world.output(4, 9)
     frame, (truth, _) = world.make(output), world.truth(output)
     assert (frame.matte.numpy()[logo] == 0.0).all() and (frame.motion.numpy()[logo] > 0.999).all()
@@ -368,10 +360,8 @@ def test_masked_logo_is_filled_from_other_plates(tmp_path, quiet):
     assert (frame.plate.numpy()[logo] > 0.5).mean() > 0.9 and (frame.source.numpy()[logo] != 4).all()
     far_from_logo = ~dilate(logo, 16)
     assert (frame.matte.numpy()[far_from_logo] == 1.0).all()
-    plain.mkdir()
-    unmasked = build(plain, quiet(), still=True, logo=logo)
-    write_json(unmasked.shot.solve_record, {**read_json(unmasked.shot.solve_record), "masks": {}})
-    assert rms_error(unmasked.make(output).color, truth, logo) > 0.3
+    write_json(world.shot.solve_record, {**read_json(world.shot.solve_record), "masks": {}})
+    assert rms_error(world.make(output).color, truth, logo) > 0.3, "else there is nothing to mask"
 
 
 def test_withheld_plates_are_not_used(tmp_path, quiet):
@@ -404,9 +394,8 @@ def test_withheld_plate_is_replaced_by_other_plates(still_world):
     assert not (result.source == 8).any() and result.plate.mean() > 0.95
 
 
-@pytest.mark.parametrize(("shift", "nearest"), [((0.02, 0.01, 0.05), 9), ((0.2, 0.0, 0.0), 6)])
-def test_custom_camera_uses_the_nearest_plate(world, shift, nearest):
-    output = replace_pose(world.output(9, 10), shift)
+def test_custom_camera_uses_the_nearest_plate(world):
+    output, nearest = replace_pose(world.output(9, 10), (0.2, 0.0, 0.0)), 6
     result = world.make(output)
     distances = (world.scene.viewmats[:, :3, 3] - output.viewmat[:3, 3]).norm(dim=1)
     assert abs(int(distances.argmin()) + 1 - nearest) <= 1, "the test's own arithmetic"
@@ -478,23 +467,22 @@ def test_overscan_goes_on_around_the_same_frame(world, composited):
 
 
 def test_frame_is_independent_of_earlier_frames(world, composited):
-    first = {key: composited(*key) for key in ((3, 11), (9, 4))}
-    for key, want in first.items():
-        single = world.make(world.output(*key))
-        for name in vars(want):
-            a, b = getattr(single, name), getattr(want, name)
-            if isinstance(a, dict):
-                assert a.keys() == b.keys() and all(torch.equal(a[term], b[term]) for term in a), (key, name)
-            else:
-                assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, (key, name)
+    composited(3, 11)
+    single, want = world.make(world.output(9, 4)), composited(9, 4)
+    for name in vars(want):
+        a, b = getattr(single, name), getattr(want, name)
+        if isinstance(a, dict):
+            assert a.keys() == b.keys() and all(torch.equal(a[term], b[term]) for term in a), name
+        else:
+            assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, name
 
 
-@pytest.mark.parametrize("case", ["own", "wide", "withheld", "elsewhere"])
+@pytest.mark.parametrize("case", ["wide", "elsewhere"])
 def test_frame_is_identical_when_computed_in_row_bands(world, monkeypatch, case):
     output = world.output(9, 4)
     if case == "elsewhere":
         output = replace_pose(output, [0.1, -0.2, 0.3])
-    options = {"beyond": (24, 16) if case == "wide" else (0, 0), "withheld": (9,) if case == "withheld" else ()}
+    options = {"beyond": (24, 16) if case == "wide" else (0, 0), "withheld": (9,) if case == "elsewhere" else ()}
     whole = world.make(output, **options)
     monkeypatch.setattr(bands, "BAND_PIXELS", 23 * W)
     parts = world.make(output, **options)

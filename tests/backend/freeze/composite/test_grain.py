@@ -34,9 +34,9 @@ def stored(picture: np.ndarray, bits: int) -> np.ndarray:
     return np.clip(np.round(picture * most), 0, most).astype(np.uint8 if bits == 8 else np.uint16)
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-@pytest.mark.parametrize("softness", [0.0, 0.6, 1.0])
-@pytest.mark.parametrize("deviation", [1.0, 4.0, 8.0])
+@pytest.mark.parametrize(
+    ("deviation", "softness", "bits"), [(1.0, 0.6, 8), (8.0, 0.0, 8), (1.0, 1.0, 16), (8.0, 0.6, 16)]
+)
 def test_known_grain_is_recovered(deviation, softness, bits):
     found = measure([stored(scene() + noise(k, softness) * deviation / 255, bits) for k in range(4)])
     np.testing.assert_allclose(found.deviation[:, 1:-1] * 255, deviation, rtol=0.1)
@@ -123,7 +123,7 @@ def test_downscaled_frame_has_downscaled_plate_grain():
     assert odd.shape == (97, 401, 3) and 0.3 < odd.std() / large.std() < 1.1
 
 
-@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (2 * WIDTH + 3, 3 * HEIGHT), (WIDTH // 2, HEIGHT // 2)])
+@pytest.mark.parametrize("size", [(WIDTH + 3, HEIGHT), (WIDTH // 2, HEIGHT // 2)])
 def test_grain_drawn_some_rows_at_a_time_is_the_same(size):
     width, height = size
     picture = np.random.default_rng(0).uniform(size=(height, width, 4)).astype(np.float32)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from benchmarks.fit_state import NAMES, Case, fit, judged
-from tests.backend.freeze.composite.test_compositor import H, W, build, dilate
+from tests.backend.freeze.composite.test_compositor import H, W, dilate
 from torch_backend.freeze.composite.compositor import Compositor
 from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, log_odds, rejection
 from torch_backend.freeze.frozen import freeze_at, render_frozen
@@ -17,11 +17,6 @@ from torch_backend.freeze.views.target_view import target_view
 
 FRAME, T_STAR = 3, 11
 """The board's positions in these two frames do not overlap."""
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory, quiet):
-    return build(tmp_path_factory.mktemp("state"), quiet())
 
 
 @pytest.fixture(scope="module")

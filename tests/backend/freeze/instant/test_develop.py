@@ -14,6 +14,7 @@ from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_key
 from torch_backend.freeze.frozen import render_frozen, span_of
 from torch_backend.freeze.instant import develop as develop_module
+from torch_backend.freeze.instant import instants as instants_module
 from torch_backend.freeze.instant import repairs as repairs_module
 from torch_backend.freeze.instant.develop import DevelopConfig, develop
 from torch_backend.freeze.instant.instants import (
@@ -26,7 +27,7 @@ from torch_backend.freeze.instant.instants import (
     load_developed,
 )
 from torch_backend.freeze.instant.missing import with_missing
-from torch_backend.freeze.instant.repairs import Moment, repaired, repairs
+from torch_backend.freeze.instant.repairs import Moment, repaired
 from torch_backend.freeze.instant.static_baseline import StaticBaselineConfig, apply_static_baseline, with_still_means
 from torch_backend.freeze.instant.undersampled import undersampled
 from torch_backend.freeze.views.scene_flow import MovingScene, SceneFlow
@@ -120,14 +121,12 @@ def same(one, second):
 
 def test_each_row_knows_what_repaired_it(developed_world):
     run, scene, frozen, now = developed_world
-    steps = repairs(config_for(run))
     changed = torch.zeros(len(frozen.support), dtype=torch.bool)
     for name, value in frozen.state.items():
         changed |= (now.state[name][: len(value)] != value).reshape(len(value), -1).any(1)
     assert torch.equal(now.origin[: len(changed)] > 0, changed) and bool((now.origin[len(changed) :] > 0).all())
     assert bool(changed.any())
     moment = Moment(run, scene, T_STAR, motion_mattes(Shot(scene.folder.parent)))
-    assert same(repaired(frozen, moment, steps), now)
     untouched = repaired(frozen, moment, [])
     assert not bool(untouched.origin.any()) and untouched.state is frozen.state
 
@@ -214,14 +213,14 @@ def test_an_instant_with_added_gaussians_is_kept_whole(world, run, scene, monkey
         )
 
     monkeypatch.setattr(repairs_module, "with_missing", grown)
-    result = developed(world.shot, run, scene, t_star, frozen)
+    result = developed(world.shot, run, scene, t_star, frozen, SHORT)
     assert len(result.support) == len(frozen.support) + 5 and len(result.origin) == len(result.support)
-    assert same(load_developed(world.shot, run, t_star, frozen), result)
+    assert same(load_developed(world.shot, run, t_star, frozen, SHORT), result)
     path = developed_path(run, t_star)
     tensors, meta = load_checkpoint(path)
     tensors["state.means"] = tensors["state.means"][:-1].clone()
     save_checkpoint(path, tensors, meta)
-    assert load_developed(world.shot, run, t_star, frozen) is None
+    assert load_developed(world.shot, run, t_star, frozen, SHORT) is None
     path.unlink()
 
 
@@ -263,15 +262,11 @@ def test_nearer_plates_are_used_even_where_the_object_moves(run, scene):
 def test_far_moving_gaussians_stay_open_without_a_matte(run, scene):
     """`doubted` closes Gaussians that sway outside of moving mattes, but never those that moved far."""
     frozen, blind = field(run, scene), lambda frame: torch.zeros(scene.height, scene.width)
-    left = {}
-    for sways in (0.0, 1e9):  # all of them moved far, then none
-        for doubted in (1.0, 1e9):
-            mended = apply_static_baseline(
-                run, scene, frozen, T_STAR, blind, StaticBaselineConfig(sways=sways, doubted=doubted)
-            )
-            left[sways, doubted] = int((mended.motion > 0.5).sum())
-    assert left[0.0, 1.0] == left[0.0, 1e9] > 0
-    assert left[1e9, 1.0] > 1.2 * left[1e9, 1e9]
+    left = []
+    for sways, doubted in ((1e9, 1e9), (1e9, 1.0), (0.0, 1e9)):  # none of them moved far, then all
+        config = StaticBaselineConfig(sways=sways, doubted=doubted)
+        left.append(int((apply_static_baseline(run, scene, frozen, T_STAR, blind, config).motion > 0.5).sum()))
+    assert min(left[1:]) > 1.2 * left[0]
 
 
 def test_undersampled_gaussians_are_found(run, scene):
@@ -291,7 +286,7 @@ def test_undersampled_gaussians_are_found(run, scene):
 
 def test_undersampled_moving_gaussians_are_not_trained(world, run, scene):
     frozen, rows, mattes = field(run, scene), run.model.open_rows(), motion_mattes(world.shot)
-    config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005)
+    config = dataclasses.replace(config_for(run), steps=20, gain=-100.0, afar=1.005)
     result = develop(run, scene, frozen, T_STAR, mattes, config)
     changed = (result.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
     undersampled_rows = undersampled(run, scene, frozen.state["means"], T_STAR, 1.005)
@@ -311,7 +306,7 @@ def test_undersampled_closed_gaussians_are_not_trained(run, scene):
     def moving(frame: int) -> torch.Tensor:
         return torch.full((scene.height, scene.width), float(frame == once))
 
-    config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005, probes=1000)
+    config = dataclasses.replace(config_for(run), steps=20, gain=-100.0, afar=1.005, probes=1000)
     result = develop(run, scene, frozen, T_STAR, moving, config)
     changed = (result.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
     plates = WorkingPlates(scene, config.width, moving, device=frozen.support.device)
@@ -325,16 +320,13 @@ def test_undersampled_closed_gaussians_are_not_trained(run, scene):
     assert float(changed[closed & ~undersampled_rows & moves].float().mean()) > 0.9
 
 
-def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(tmp_path, quiet):
+def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(trained):
     """Plates in which the object is elsewhere do not prove that its field is harmful at t*."""
-    world = build_world(tmp_path)
-    paint_motion(world)
-    # A run with fewer steps opens a tenth as many Gaussians, and the result is random.
-    train_shot(world.shot, TrainParams(iterations=900, holdout=8, max_gaussians=1500), quiet())
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    # The run of `world` opens a tenth as many Gaussians, and the result is random.
+    run, scene = load_run(trained.shot, "main"), load_scene(trained.shot)
     frozen, rows = field(run, scene), run.model.open_rows()
     blind = apply_static_baseline(run, scene, frozen, T_STAR, lambda frame: torch.zeros(scene.height, scene.width))
-    was, now = (scores(world, run, scene, f)[0] for f in (frozen, blind))
+    was, now = (scores(trained, run, scene, f)[0] for f in (frozen, blind))
     # Six trainings (three seeds at two learning rates) gave 0.43 to 0.58, and at most 1.1 dB.
     assert float((blind.motion[rows] > 0.5).float().mean()) > 0.35 and now > was - 2.0
 
@@ -342,9 +334,11 @@ def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(tmp_path, quiet)
 def test_a_developed_instant_is_nearer_to_the_truth(world, developed_world):
     run, scene, frozen, now = developed_world
     (moving, still), (was_moving, was_still) = (scores(world, run, scene, f) for f in (now, frozen))
-    assert (
-        still > was_still + 0.3 and moving > was_moving - 0.3
-    )  # three seeds of the training gave at least 3.3 and 0.5
+    # Three seeds of the training gave at least 3.3 and 0.5.
+    assert still > was_still + 0.3 and moving > was_moving - 0.3
+    # In plates far from t* the patch is elsewhere, and its place at t* shows the wall: it must not be erased.
+    before, after = (scores(world, run, scene, f, (113, 114, 115))[0] for f in (frozen, now))
+    assert after > before - 1.0 and not torch.equal(now.state["sh0"], frozen.state["sh0"])
 
 
 def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(world, run, scene):
@@ -353,18 +347,9 @@ def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(world, run, sc
     run.model.gaussians.params["sh0"].data[rows] = 0.0
     run.model.gaussians.params["opacity_logits"].data[rows] -= 2.0
     lacking = field(run, scene)
-    back = developed(world.shot, run, scene, T_STAR, lacking, DevelopConfig(steps=250), keep=False)
+    back = developed(world.shot, run, scene, T_STAR, lacking, DevelopConfig(steps=130), keep=False)
     (moving, still), (was_moving, was_still) = (scores(world, run, scene, f) for f in (back, lacking))
     assert moving > was_moving + 6.0 and still > was_still - 0.5
-
-
-def test_object_missing_in_neighbour_plates_is_not_erased(world, developed_world):
-    """In plates far from t* the patch is elsewhere, and its place at t* shows the wall."""
-    run, scene, frozen, _ = developed_world
-    config = DevelopConfig(steps=200, gain=-99.0)  # accepts any change on held-out frames
-    now = develop(run, scene, frozen, T_STAR, motion_mattes(world.shot), config)
-    before, after = (scores(world, run, scene, f, (113, 114, 115))[0] for f in (frozen, now))
-    assert after > before - 1.0 and not torch.equal(now.state["sh0"], frozen.state["sh0"])
 
 
 def test_a_kept_instant_is_read_back_to_the_bit(world, developed_world):
@@ -378,7 +363,7 @@ def test_a_kept_instant_is_read_back_to_the_bit(world, developed_world):
 
 def test_only_movers_are_developed_if_static_pixels_gain_little(world, developed_world):
     run, scene, frozen, _ = developed_world
-    config, path = DevelopConfig(steps=150, gain=99.0), developed_path(run, 106)
+    config, path = DevelopConfig(steps=80, gain=99.0), developed_path(run, 106)
     frozen = field(run, scene, 106)
     try:
         now = developed(world.shot, run, scene, 106, frozen, config)
@@ -412,7 +397,7 @@ def test_evidence_of_plate_t_star_is_weighted_by_neighbour_plates(shot_copy, mon
     states = {}
     monkeypatch.setattr(develop_module, "_TRAINING", TrainConfig(lr_sh0=0.2))
     for worth in (0.0, 100.0):
-        config = DevelopConfig(steps=150, gain=99.0, worth=worth)
+        config = DevelopConfig(steps=60, gain=99.0, worth=worth)
         states[worth] = develop(run, scene, frozen, T_STAR, motion_mattes(shot), config).state["sh0"]
     deceived, careful = ((sh0 - frozen.state["sh0"]).abs().mean() for sh0 in states.values())
     assert deceived > 0.0 and careful < 0.6 * deceived
@@ -450,7 +435,7 @@ def test_damaged_or_mismatched_instant_is_recomputed(shot_copy):
 
 def test_held_out_instant_is_trained_from_adjacent_plates(shot_copy):
     shot, run, scene, _ = shot_copy
-    frame, config = 109, DevelopConfig(steps=100, gain=-99.0)
+    frame, config = 109, DevelopConfig(steps=20, gain=-99.0)
     assert frame not in run.train_frames
     frozen, mattes = field(run, scene, frame), motion_mattes(shot)
     developed_world = [
@@ -483,18 +468,15 @@ def test_cancelling_leaves_nothing(shot_copy, quiet):
     assert len(report.events) == 1 + math.ceil(0.01 * config_for(run).steps), "it stops at once"
 
 
-def test_take_is_finished_even_if_the_instant_cannot_be_stored(world, shot_copy, developed_world, quiet):
+def test_take_is_finished_even_if_the_instant_cannot_be_stored(world, shot_copy, quiet, monkeypatch):
     shot, run, _, _ = shot_copy
     (run.folder / "developed").write_text("in the way")
     report = quiet()
-    ask = dict(t_star=T_STAR, first=105, last=106, detail="off", grain=False)
-    assert freeze_shot(shot, FreezeParams(**ask), report)["developed"] == [T_STAR]
-    warnings = report.warnings
-    assert (
-        len(warnings) == 1
-        and warnings[0].startswith("The developed instant was not saved:")
-        and "is not a folder" in warnings[0]
-    )
+    monkeypatch.setattr(instants_module, "config_for", lambda run: SHORT)
+    ask = dict(t_star=106, first=106, last=106, detail="off", grain=False)
+    assert freeze_shot(shot, FreezeParams(**ask), report)["developed"] == [106]
+    (warning,) = report.warnings
+    assert "was not saved" in warning and "is not a folder" in warning
     assert (run.folder / "developed").read_text() == "in the way"
     freeze_shot(world.shot, FreezeParams(take="kept", **ask), quiet())
     pictures = [read_png(s.take(t) / "preview" / "000106.png") for s, t in ((shot, "freeze"), (world.shot, "kept"))]
@@ -503,12 +485,12 @@ def test_take_is_finished_even_if_the_instant_cannot_be_stored(world, shot_copy,
 
 def test_switching_develop_rerenders_frames(world, developed_world, quiet):
     keys, facts, frame = [], [], world.shot.take("switched") / "000105.exr"
-    for wanted in ("off", "off", "on", "on", "off"):
-        ask = FreezeParams(take="switched", t_star=T_STAR, first=105, last=105, only_missing=True, develop=wanted)
-        facts.append(freeze_shot(world.shot, ask, quiet()).get("developed"))
+    ask = dict(take="switched", t_star=T_STAR, first=105, last=105, only_missing=True, detail="off", grain=False)
+    for wanted in ("off", "on", "on", "off"):
+        facts.append(freeze_shot(world.shot, FreezeParams(**ask, develop=wanted), quiet()).get("developed"))
         keys.append((read_key(frame), frame.stat().st_mtime_ns))
-    assert facts == [None, None, [T_STAR], [T_STAR], None]
-    assert keys[0] == keys[1] != keys[2] == keys[3] and keys[4][0] == keys[0][0] != keys[2][0]
+    assert facts == [None, [T_STAR], [T_STAR], None]
+    assert keys[0] != keys[1] == keys[2] and keys[3][0] == keys[0][0] != keys[2][0]
 
 
 def test_keyed_instants_of_trained_frames_are_developed_up_to_a_limit(world, developed_world):
@@ -547,17 +529,17 @@ def test_scrubbing_shows_an_instant_as_soon_as_it_has_been_developed(world, deve
     assert np.abs(before[1] - seen()[1]).mean() > 1e-3
 
 
-@pytest.mark.parametrize("t_star", [101, 116])
-def test_a_run_in_which_nothing_moves_is_developed_at_its_ends(world, quiet, t_star):
-    """The run has no open Gaussians, and the shot has no mattes."""
-    if not (world.shot.run("still") / "summary.json").is_file():
-        train_shot(world.shot, TrainParams(run="still", iterations=60, method="static", holdout=0), quiet())
+def test_a_run_in_which_nothing_moves_is_developed_at_its_ends(world, quiet):
+    """The run has no open Gaussians."""
+    train_shot(world.shot, TrainParams(run="still", iterations=30, method="static", holdout=0), quiet())
     run, scene = load_run(world.shot, "still"), load_scene(world.shot)
     assert not len(run.model.open_rows())
-    now = developed(world.shot, run, scene, t_star, field(run, scene, t_star), DevelopConfig(steps=300), keep=False)
-    plate = world.image(t_star - 101, (t_star - 101) / 15)
-    errors = [(shown(run, scene, f, t_star) - plate).square().mean() for f in (field(run, scene, t_star), now)]
-    assert errors[1] < 0.9 * errors[0] and not developed_path(run, t_star).exists()
+    for t_star in (101, 116):
+        was = field(run, scene, t_star)
+        now = developed(world.shot, run, scene, t_star, was, DevelopConfig(steps=60), keep=False)
+        plate = world.image(t_star - 101, (t_star - 101) / 15)
+        errors = [(shown(run, scene, f, t_star) - plate).square().mean() for f in (was, now)]
+        assert errors[1] < 0.9 * errors[0] and not developed_path(run, t_star).exists()
 
 
 def test_instants_are_developed_as_large_as_the_run(developed_world):

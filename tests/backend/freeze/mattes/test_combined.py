@@ -28,7 +28,7 @@ from torch_backend.freeze.mattes.job import make_mattes
 from torch_backend.freeze.surface.job import make_surface
 from torch_backend.shot import write_json
 
-FIRST, LAST = 104, 111
+FIRST, LAST = 104, 109
 INSTANTS = {"early": 105, "late": 113}
 """Instants of the two takes; the patch's places differ."""
 
@@ -43,7 +43,7 @@ def world(trained_copy, quiet, tmp_path_factory):
     """The tiny world with a take at each instant, and mattes of the patch in both takes."""
     world = trained_copy
     for name, t_star in INSTANTS.items():
-        params = FreezeParams(take=name, t_star=t_star, first=FIRST, last=LAST, passes=True)
+        params = FreezeParams(take=name, t_star=t_star, first=FIRST, last=LAST, passes=True, develop="off")
         freeze_shot(world.shot, params, quiet())
         row = {"name": "patch", "frame": 107, "polygon": outline(covered(world, 107, t_star))}
         path = tmp_path_factory.mktemp("lassos") / "lassos.json"
@@ -88,7 +88,7 @@ def test_object_can_come_from_a_second_instant(world, quiet):
 
 def test_live_object_moves_while_the_rest_is_frozen(world, quiet):
     combine(world.shot, CombineParams(take="alive", base="early", things="patch=live"), quiet())
-    for n in (104, 109, 111):
+    for n in (104, 107, 109):
         frame, now = frame_of(world, "alive", n), covered(world, n, n)
         inside = cv2.erode(np.uint8(now), np.ones((3, 3))) > 0
         assert error(world, "alive", n, n, inside) < 1e-3
@@ -130,7 +130,7 @@ def test_what_cannot_be_combined_is_said(world, quiet):
     combine(world.shot, CombineParams(take="mine", base="early", things="patch=live"), quiet())
     with pytest.raises(JobError, match="keeps moving"):
         make_surface(world.shot, SurfaceParams(take="mine"), quiet())
-    freeze_shot(world.shot, FreezeParams(take="wide", t_star=105, first=FIRST, last=LAST, width=128), quiet())
+    freeze_shot(world.shot, FreezeParams(take="wide", t_star=105, last=102, detail="off", develop="off"), quiet())
     refused("has no matte", base="wide")
 
 

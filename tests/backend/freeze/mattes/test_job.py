@@ -1,6 +1,7 @@
 """Mattes of a take of the tiny world, compared with its truth at every pose; caching, updates, removal, refusals."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -20,12 +21,22 @@ def truth(world, pose):
     return world.patch(pose - 101, (T_STAR - 101) / 15) > 0.5
 
 
+ASK = dict(t_star=T_STAR, first=104, last=112, detail="off", develop="off")
+
+
+@pytest.fixture(scope="module")
+def frozen(trained_copy, quiet):
+    """(world, folder of a take without mattes)."""
+    freeze_shot(trained_copy.shot, FreezeParams(take="clean", **ASK), quiet())
+    return trained_copy, trained_copy.shot.take("clean")
+
+
 @pytest.fixture
-def take(trained_copy, quiet, tmp_path, request):
+def take(frozen, tmp_path, request):
     """(world, folder of a new take, function that writes a lasso file)."""
-    world = trained_copy
+    world, clean = frozen
     name = f"m{abs(hash(request.node.name)) % 10**9}"
-    freeze_shot(world.shot, FreezeParams(take=name, t_star=T_STAR, first=104, last=112, detail="off"), quiet())
+    shutil.copytree(clean, world.shot.take(name))
 
     def lassos(*rows):
         path = tmp_path / f"lassos{len(list(tmp_path.iterdir()))}.json"
@@ -60,6 +71,19 @@ def test_one_lasso_is_a_matte_at_every_pose(take, quiet):
     assert [lasso.name for lasso in stored_lassos(folder, 64, 48)] == ["patch"]
 
 
+def test_one_matte_is_removed_and_the_second_becomes_pictures(take, quiet):
+    world, folder, lassos = take
+    params = lassos(patch(world), CORNER)
+    make_mattes(world.shot, params, quiet())
+    result = make_mattes(world.shot, MatteParams(take=folder.root.name, remove="corner", matte_format="png"), quiet())
+    assert list(result["mattes"]) == ["patch"]
+    assert [p.name for p in folder.single_mattes.iterdir()] == ["patch"]
+    assert {p.suffix for p in folder.matte_frames("patch").iterdir()} == {".png"}
+    assert (read_matte(folder.matte_frames("patch") / "000110.png", (0, 0)) > 0.5).any()
+    make_mattes(world.shot, MatteParams(take=folder.root.name, remove="patch"), quiet())
+    assert not list(folder.single_mattes.iterdir()) and not list(folder.cryptomattes.iterdir())
+
+
 def test_current_mattes_are_kept_and_stale_ones_recomputed(take, quiet):
     world, folder, lassos = take
     make_mattes(world.shot, lassos(patch(world)), quiet())
@@ -72,29 +96,9 @@ def test_current_mattes_are_kept_and_stale_ones_recomputed(take, quiet):
     first.write_bytes(b"cut off")
     assert make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())["made"] == ["patch"]
     assert read_matte(first, (0, 0)).any()
-    freeze_shot(world.shot, FreezeParams(take=folder.root.name, t_star=106, first=104, last=112, detail="off"), quiet())
+    freeze_shot(world.shot, FreezeParams(take=folder.root.name, **{**ASK, "t_star": 106}), quiet())
     result = make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())
     assert sorted(result["made"]) == ["corner", "patch"]
-
-
-def test_removing_one_matte_keeps_the_second(take, quiet):
-    world, folder, lassos = take
-    make_mattes(world.shot, lassos(patch(world), CORNER), quiet())
-    result = make_mattes(world.shot, MatteParams(take=folder.root.name, remove="corner"), quiet())
-    assert list(result["mattes"]) == ["patch"] and result["made"] == []
-    assert [p.name for p in folder.single_mattes.iterdir()] == ["patch"]
-    make_mattes(world.shot, MatteParams(take=folder.root.name, remove="patch"), quiet())
-    assert not list(folder.single_mattes.iterdir()) and not list(folder.cryptomattes.iterdir())
-
-
-def test_pictures_take_the_place_of_exrs(take, quiet):
-    world, folder, lassos = take
-    params = lassos(patch(world))
-    make_mattes(world.shot, params, quiet())
-    params.matte_format = "png"
-    make_mattes(world.shot, params, quiet())
-    assert {p.suffix for p in folder.matte_frames("patch").iterdir()} == {".png"}
-    assert (read_matte(folder.matte_frames("patch") / "000110.png", (0, 0)) > 0.5).any()
 
 
 def test_a_cancelled_job_goes_on(take, quiet):

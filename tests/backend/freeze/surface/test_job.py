@@ -20,7 +20,7 @@ T_STAR = 105
 @pytest.fixture(scope="module")
 def take(trained, quiet):
     """(world, folder of a take)."""
-    freeze_shot(trained.shot, FreezeParams(take="solid", t_star=T_STAR, first=102, last=116, detail="off"), quiet())
+    freeze_shot(trained.shot, FreezeParams(take="solid", t_star=T_STAR, first=102, step=2, detail="off"), quiet())
     return trained, TakeFolder(trained.shot.take("solid"))
 
 

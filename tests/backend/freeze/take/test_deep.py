@@ -49,7 +49,7 @@ def take(trained_copy, quiet, tmp_path_factory):
     file = tmp_path_factory.mktemp("placed") / "placement.json"
     write_json(file, PLACED.to_json())
     params = FreezeParams(
-        take="deep", t_star=105, first=104, last=106, deep=True, only_missing=True, placement=str(file)
+        take="deep", t_star=105, first=104, last=106, deep=True, only_missing=True, develop="off", placement=str(file)
     )
     facts = freeze_shot(trained_copy.shot, params, quiet())
     assert facts["deep"]

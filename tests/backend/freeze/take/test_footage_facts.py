@@ -54,14 +54,22 @@ def facts_of(shot):
     return footage_facts(shot, take), take
 
 
-def test_footage_without_a_lens(tmp_path, shot_of):
-    facts, take = facts_of(shot_of(pictures(tmp_path / "plate")))
+def test_footage_without_a_lens_of_a_varying_rate_and_gone(tmp_path, shot_of):
+    shot = shot_of(pictures(tmp_path / "plate"))
+    facts, take = facts_of(shot)
     assert facts["file"] == str(tmp_path / "plate" / "a.1001.png") and facts["beside"] == "../plate/a.1001.png"
     assert (facts["size"], facts["first"], facts["last"], facts["unlike"]) == ([128, 96], 1001, 1009, "")
     assert facts["probe"] == pytest.approx(srgb_to_linear(PROBE)) and facts["map"] == "" and not list(take.iterdir())
+    record = json.loads(shot.listing.read_text())
+    record["frames"][-1]["seconds"] += 0.03
+    shot.listing.write_text(json.dumps(record))
+    assert facts_of(shot)[0]["unlike"] == "its rate varies"
+    for file in (tmp_path / "plate").iterdir():
+        file.rename(file.with_suffix(".away"))
+    assert facts_of(shot)[0] == {}
 
 
-def test_full_size_map_undistorts_like_the_plates(tmp_path, shot_of):
+def test_full_size_map_undistorts_like_the_plates_and_is_computed_once_per_solve(tmp_path, shot_of):
     """The map gives positions in the footage's pixels; sampled with it, the footage equals the plate."""
     shot = shot_of(pictures(tmp_path / "plate"), radial=-0.2)
     facts, take = facts_of(shot)
@@ -74,16 +82,10 @@ def test_full_size_map_undistorts_like_the_plates(tmp_path, shot_of):
     raw = torch.from_numpy(read_png(tmp_path / "plate" / "a.1005.png").astype(np.float32) / 255.0)
     seen, plate = sample(raw, torch.from_numpy(st[..., :2].copy())), Plates(shot).display(1005)
     assert float((seen - plate).abs()[3:-3, 3:-3].mean()) < 0.01 < float((raw - plate).abs().mean())
-
-
-def test_map_is_computed_once_per_solve(tmp_path, shot_of):
-    shot = shot_of(pictures(tmp_path / "plate"), radial=-0.2)
-    _, take = facts_of(shot)
-    file = take / "stmap" / "undistort.exr"
-    before = file.stat().st_mtime_ns
+    file = take / facts["map"]
+    before, pixels = file.stat().st_mtime_ns, file.read_bytes()
     facts_of(shot)
     assert file.stat().st_mtime_ns == before
-    pixels = file.read_bytes()
     solved(shot, -0.15)
     facts_of(shot)
     assert file.read_bytes() != pixels
@@ -98,21 +100,6 @@ def test_log_footage_says_what_light_it_means(tmp_path, shot_of):
 def test_footage_that_blender_shows_differently_is_recorded(tmp_path, shot_of):
     facts, _ = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr", PixelAspectRatio=2.0)))
     assert facts["unlike"] == "its pixels are not square"
-
-
-def test_variable_frame_rate_is_recorded(tmp_path, shot_of):
-    shot = shot_of(pictures(tmp_path / "plate"))
-    record = json.loads(shot.listing.read_text())
-    record["frames"][-1]["seconds"] += 0.03
-    shot.listing.write_text(json.dumps(record))
-    assert facts_of(shot)[0]["unlike"] == "its rate varies"
-
-
-def test_footage_that_is_gone_or_another_is_not_named(tmp_path, shot_of):
-    shot = shot_of(pictures(tmp_path / "plate"))
-    for file in (tmp_path / "plate").iterdir():
-        file.rename(file.with_suffix(".away"))
-    assert facts_of(shot)[0] == {}
 
 
 def test_picture_orientation_is_recorded(tmp_path, shot_of):

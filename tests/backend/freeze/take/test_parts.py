@@ -2,18 +2,16 @@
 refused."""
 
 import os
-import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from torch_backend.contract import FreezeParams, JobError
 from torch_backend.freeze import finish_take, freeze_part, freeze_shot, open_take
+from torch_backend.freeze.instant import instants as developed_instants
+from torch_backend.freeze.instant.develop import DevelopConfig
 from torch_backend.shot import write_json
 
-ASK = dict(t_star=104, first=103, last=108, only_missing=True, deep=True)
+ASK = dict(t_star=105, first=103, last=106, only_missing=True, deep=True)
 
 
 @pytest.fixture(scope="module")
@@ -35,18 +33,18 @@ def part(shot, take, first, last, report):
 
 def test_frames_rendered_in_parts_equal_a_single_render(frozen_shot, quiet):
     params = FreezeParams(take="parts", **ASK)
-    assert open_take(frozen_shot, params, quiet()) == {"t_star": 104, "first": 103, "last": 108, "frames": 6}
-    assert part(frozen_shot, "parts", 107, 109, quiet()) == {"frames": 3, "rendered": 3}
-    with pytest.raises(JobError, match=r"lacks 4 of 6 frames, the first is 103"):
+    assert open_take(frozen_shot, params, quiet()) == {"t_star": 105, "first": 103, "last": 106, "frames": 4}
+    assert part(frozen_shot, "parts", 106, 107, quiet()) == {"frames": 2, "rendered": 2}
+    with pytest.raises(JobError, match=r"lacks 3 of 4 frames, the first is 103"):
         finish_take(frozen_shot, params, quiet())
     assert not (frozen_shot.take("parts") / "take.json").exists()
-    assert part(frozen_shot, "parts", 103, 105, quiet()) == {"frames": 3, "rendered": 3}
-    assert part(frozen_shot, "parts", 106, 106, quiet()) == {"frames": 1, "rendered": 1}
+    assert part(frozen_shot, "parts", 103, 104, quiet()) == {"frames": 2, "rendered": 2}
+    assert part(frozen_shot, "parts", 105, 105, quiet()) == {"frames": 1, "rendered": 1}
     assert part(frozen_shot, "parts", 900, 910, quiet()) == {"frames": 0, "rendered": 0}
     facts = finish_take(frozen_shot, params, quiet())
-    assert (facts["first"], facts["last"], facts["frames"]) == (103, 109, 7)
+    assert (facts["first"], facts["last"], facts["frames"]) == (103, 107, 5)
     at_once, in_parts = files(frozen_shot.take("whole")), files(frozen_shot.take("parts"))
-    assert len(at_once) == 24
+    assert len(at_once) == 16
     assert all(in_parts[name] == data for name, data in at_once.items())
 
 
@@ -64,10 +62,9 @@ def test_killed_part_is_rerendered_and_others_kept(frozen_shot, quiet):
 
 
 def test_an_instant_that_two_develop_at_once_is_the_first_ones(frozen_shot, quiet, monkeypatch):
-    from torch_backend.freeze.instant import instants as developed_instants
-
     path = frozen_shot.run("main") / "developed" / "000106.safetensors"
     make, first = developed_instants._make, []
+    monkeypatch.setattr(developed_instants, "config_for", lambda run: DevelopConfig(steps=3))
 
     def meanwhile(*words):
         if not first:
@@ -90,11 +87,11 @@ def test_parts_of_what_was_not_opened_or_of_another_run_are_refused(frozen_shot,
     open_take(frozen_shot, FreezeParams(take="parts2", **ASK), quiet())
     state = frozen_shot.take("parts2") / "state.json"
     part(frozen_shot, "parts2", 103, 103, quiet())
-    write_json(state, {"version": 1, "key": "other", "t_star": 104, "frames": "other"})
+    write_json(state, {"version": 1, "key": "other", "t_star": 105, "frames": "other"})
     with pytest.raises(JobError, match="another run, other footage"):
         part(frozen_shot, "parts2", 104, 104, quiet())
     open_take(frozen_shot, FreezeParams(take="parts2", **ASK), quiet())
-    os.remove(frozen_shot.run("main") / "developed" / "000104.safetensors")
+    os.remove(frozen_shot.run("main") / "developed" / "000105.safetensors")
     with pytest.raises(JobError, match="is missing from the run"):
         part(frozen_shot, "parts2", 104, 104, quiet())
 
@@ -116,46 +113,29 @@ def test_frames_of_before_stay_until_the_take_is_finished(frozen_shot, quiet):
     assert not (frozen_shot.take("again") / "preview" / "000104.png").exists()
 
 
-KILLED = """
-import os, signal, sys
-from torch_backend.contract import FreezeParams, Reporter
-from torch_backend.freeze import freeze_part, open_take
-from torch_backend.shot import Shot
-
-class Quiet(Reporter): pass
-
-root, take, writes = sys.argv[1], sys.argv[2], int(sys.argv[3])
-shot, replace, seen = Shot.open(root), os.replace, []
-params = FreezeParams(take=take, t_star=110, first=103, last=104, only_missing=True, develop="off")
-open_take(shot, params, Quiet())
-
-def counted(source, target):
-    replace(source, target)
-    seen.append(target)
-    if len(seen) == writes:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-os.replace = counted
-freeze_part(shot, params, Quiet())
-"""
-"""Freezes two frames at another instant, and kills itself after `writes` files are renamed to their final names."""
+class Killed(BaseException):
+    """Ends a part like a kill."""
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
-@pytest.mark.parametrize("writes", [1, 2])
-def test_what_a_killed_part_of_another_instant_left_is_in_no_frame(frozen_shot, quiet, writes):
-    take = f"mixed{writes}"
-    params = FreezeParams(take=take, **{**ASK, "last": 104, "develop": "off"})
+def test_what_a_killed_part_of_another_instant_left_is_in_no_frame(frozen_shot, quiet, monkeypatch):
+    params = FreezeParams(take="mixed", **{**ASK, "last": 103, "develop": "off"})
     freeze_shot(frozen_shot, params, quiet())
-    before = files(frozen_shot.take(take))
-    environ = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[4])}
-    command = [sys.executable, "-P", "-c", KILLED, str(frozen_shot.root), take, str(writes)]
-    assert subprocess.run(command, env=environ).returncode == -signal.SIGKILL
-    assert not (frozen_shot.take(take) / "take.json").exists() and files(frozen_shot.take(take)) != before
+    folder, replace, before = frozen_shot.take("mixed"), os.replace, files(frozen_shot.take("mixed"))
+    second_params = FreezeParams(take="mixed", **{**ASK, "last": 103, "t_star": 110, "develop": "off"})
+    open_take(frozen_shot, second_params, quiet())
+
+    def dies(source, target):
+        replace(source, target)
+        raise Killed
+
+    with monkeypatch.context() as patched, pytest.raises(Killed):
+        patched.setattr(os, "replace", dies)
+        freeze_part(frozen_shot, second_params, quiet())
+    assert not (folder / "take.json").exists() and files(folder) != before
     open_take(frozen_shot, params, quiet())
     freeze_part(frozen_shot, params, quiet())
     finish_take(frozen_shot, params, quiet())
-    assert files(frozen_shot.take(take)) == before
+    assert files(folder) == before
 
 
 def test_a_part_stops_when_its_take_is_opened_with_something_else(frozen_shot, quiet):
@@ -179,15 +159,12 @@ def test_a_part_stops_when_its_take_is_opened_with_something_else(frozen_shot, q
     assert frames and facts["frames"] == 3
 
 
-@pytest.mark.parametrize(
-    ("name", "share"),
-    [("000103.exr", 0.75), ("000103.exr", 0.0), ("warp/000103.exr", 0.75), ("preview/000103.png", 0.75)],
-)
-def test_truncated_frame_is_rendered_again(frozen_shot, quiet, name, share):
-    params = FreezeParams(take="cut", **{**ASK, "last": 103})
+def test_truncated_or_missing_file_of_a_frame_is_written_again(frozen_shot, quiet):
+    params = FreezeParams(take="cut", **{**ASK, "last": 103, "deep": False})
     freeze_shot(frozen_shot, params, quiet())
-    file = frozen_shot.take("cut") / name
-    data = file.read_bytes()
-    file.write_bytes(data[: int(len(data) * share)])
-    freeze_shot(frozen_shot, params, quiet())
-    assert file.read_bytes() == data
+    for name, share in (("000103.exr", 0.75), ("preview/000103.png", 0.75), ("warp/000103.exr", None)):
+        file = frozen_shot.take("cut") / name
+        data = file.read_bytes()
+        file.unlink() if share is None else file.write_bytes(data[: int(len(data) * share)])
+        freeze_shot(frozen_shot, params, quiet())
+        assert file.read_bytes() == data, (name, share)

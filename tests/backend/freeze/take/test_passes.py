@@ -109,8 +109,9 @@ def test_a_takes_passes_lie_on_its_cameras(trained, tmp_path, quiet):
     placement = Placement([0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0])
     write_json(tmp_path / "placement.json", placement.to_json())
     params = FreezeParams(
-        take="passes", t_star=105, first=104, last=106, passes=True, placement=str(tmp_path / "placement.json")
-    )
+        take="passes", t_star=105, first=104, last=106, passes=True, develop="off",
+        placement=str(tmp_path / "placement.json"),
+    )  # fmt: skip
     facts = freeze_shot(trained.shot, params, quiet())
     assert facts["passes"]
     back = Similarity.of(placement).inverse()

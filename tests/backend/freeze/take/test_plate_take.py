@@ -3,10 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -24,12 +20,12 @@ from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.composite.state import StateConfig, rejection
 from torch_backend.freeze.composite.warp import apply_warp, read_warp
 from torch_backend.freeze.exr import read_frozen_exr, read_key
+from torch_backend.freeze.take import frames as take_frames
 from torch_backend.freeze.take.plan import planned
 from torch_backend.motion.mattes import PAINTED, STILL, write_matte
 from torch_backend.shot import write_json
 from torch_backend.train import train_shot
 
-ROOT = Path(__file__).resolve().parents[4]
 RANGE = {"t_star": 105, "first": 103, "last": 108}
 
 
@@ -56,21 +52,18 @@ def take(trained, quiet):
 def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
     """With `--debug-terms`, the frames are rendered again without change, and the log-odds reproduce the matte."""
     before = files(take[0])
-    freeze_shot(
-        trained.shot, FreezeParams(take="whole", only_missing=True, debug_terms=str(tmp_path), **RANGE), quiet()
-    )
+    ask = dict(RANGE, last=103, only_missing=True, debug_terms=str(tmp_path))
+    freeze_shot(trained.shot, FreezeParams(take="whole", **ask), quiet())
     assert files(take[0]) == before
-    assert sorted(path.stem for path in tmp_path.iterdir()) == [f"{n:06d}" for n in range(103, 109)]
     config = StateConfig()
-    for n in (103, 108):
-        image = oiio.ImageBuf(str(tmp_path / f"{n:06d}.exr"))
-        terms = dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), 2, 0), strict=True))
-        assert {"plate_matte", "change", "unseen", "agreed.105", "origin.develop"} <= terms.keys()
-        matte = read_warp(take[0] / "warp" / f"{n:06d}.exr").matte
-        kept = 1.0 - rejection(torch.from_numpy(terms["log_odds"]), config)
-        assert kept.shape == matte.shape and float(kept.min()) < 0.1 < float(kept.max())
-        np.testing.assert_allclose(np.asarray(matte), kept, atol=0.01)
-        assert 0.02 < terms["origin.develop"].mean() <= 1.0
+    image = oiio.ImageBuf(str(*tmp_path.iterdir()))
+    terms = dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), 2, 0), strict=True))
+    assert {"plate_matte", "change", "unseen", "agreed.105", "origin.develop"} <= terms.keys()
+    matte = read_warp(take[0] / "warp" / "000103.exr").matte
+    kept = 1.0 - rejection(torch.from_numpy(terms["log_odds"]), config)
+    assert kept.shape == matte.shape and float(kept.min()) < 0.1 < float(kept.max())
+    np.testing.assert_allclose(np.asarray(matte), kept, atol=0.01)
+    assert 0.02 < terms["origin.develop"].mean() <= 1.0
 
 
 def test_a_frame_is_its_warp_over_the_plate(trained, take):
@@ -92,76 +85,50 @@ def test_a_frame_is_its_warp_over_the_plate(trained, take):
 
 def test_without_detail_only_splats_are_rendered(trained, take, quiet):
     folder, _ = take
-    whole = files(folder)
-    facts = freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, detail="off"), quiet())
+    part = dict(RANGE, first=107)
+    facts = freeze_shot(trained.shot, FreezeParams(take="bare", **part, detail="off"), quiet())
     bare = trained.shot.take("bare")
     assert not (bare / "warp").exists() and "detail" not in facts and "warp_dir" not in facts
-    for n in (103, 108):
+    for n in (107, 108):
         plain, detailed = read_frozen_exr(bare / f"{n:06d}.exr"), read_frozen_exr(folder / f"{n:06d}.exr")
         assert plain.detail is None
         splat = np.asarray(detailed.detail.splat)[..., :3]
         np.testing.assert_allclose(splat, plain.rgba[..., :3], rtol=4e-3, atol=1e-4)
-    freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, only_missing=True), quiet())
-    assert files(bare) == whole, "asked for plates, none of the old frames is right"
-    freeze_shot(trained.shot, FreezeParams(take="bare", **RANGE, only_missing=True, detail="off"), quiet())
+    freeze_shot(trained.shot, FreezeParams(take="bare", **part, only_missing=True), quiet())
+    with_plates, whole = files(bare), files(folder)
+    assert len(with_plates) == 6, "asked for plates, none of the old frames is right"
+    assert all(whole[name] == content for name, content in with_plates.items()), "nor does the range matter"
+    freeze_shot(trained.shot, FreezeParams(take="bare", **part, only_missing=True, detail="off"), quiet())
     assert not list((bare / "warp").glob("*.exr")), "warps of frames that are gone are gone"
 
 
-def test_single_frame_equals_the_same_frame_in_a_range(trained, take, quiet):
-    freeze_shot(trained.shot, FreezeParams(take="one", **{**RANGE, "first": 107, "last": 107}), quiet())
-    one, whole = files(trained.shot.take("one")), files(take[0])
-    assert len(one) == 3
-    assert all(whole[name] == content for name, content in one.items())
+class Killed(BaseException):
+    """Ends a take like a kill."""
 
 
-CHILD = """
-import os, signal, sys
-sys.path.insert(0, sys.argv[3])
-from tests.backend.conftest import Quiet
-from torch_backend.contract import FreezeParams
-from torch_backend.freeze import freeze_shot
-from torch_backend.freeze.take import frames as take_frames
-from torch_backend.shot import Shot
+def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet, monkeypatch):
+    """The take was killed after it had written a warp but not its frame."""
+    ask, write = FreezeParams(take="killed", **{**RANGE, "last": 105}, only_missing=True), take_frames._write_frame
 
-def dies(folder, output, *rest):
-    if output.frame == 106:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return written(folder, output, *rest)
+    def dies(folder, output, *rest):
+        if output.frame == 104:
+            raise Killed
+        return write(folder, output, *rest)
 
-written, take_frames._write_frame = take_frames._write_frame, dies
-freeze_shot(Shot.open(sys.argv[1]), FreezeParams(take=sys.argv[2], t_star=105, first=103, last=108), Quiet())
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
-def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
-    """The process was killed after it had written a warp but not its frame."""
-    name = "killed"
-    words = ["-P", "-c", CHILD, str(trained.shot.root), name, str(ROOT)]
-    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    folder = trained.shot.take(name)
+    with monkeypatch.context() as patched, pytest.raises(Killed):
+        patched.setattr(take_frames, "_write_frame", dies)
+        freeze_shot(trained.shot, ask, quiet())
+    folder = trained.shot.take("killed")
     left = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
-    assert sorted(left) == ["000103.exr", "000104.exr", "000105.exr"]
-    assert (folder / "warp" / "000106.exr").is_file()
-    freeze_shot(trained.shot, FreezeParams(take=name, **RANGE, only_missing=True), quiet())
-    assert files(folder) == files(take[0])
-    assert all((folder / n).stat().st_mtime_ns == time for n, time in left.items())
-    facts = [json.loads((f / "take.json").read_text())["detail"] for f in (folder, take[0])]
-    assert facts[0]["per_frame"][3:] == facts[1]["per_frame"][3:]
-    assert facts[0]["plate_share"] == pytest.approx(facts[1]["plate_share"], abs=2e-3)
-
-
-def test_frame_without_its_warp_is_rendered_again(trained, take, quiet):
-    ask = FreezeParams(take="torn", **{**RANGE, "last": 104}, only_missing=True)
-    freeze_shot(trained.shot, ask, quiet())
-    folder = trained.shot.take("torn")
-    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
-    (folder / "warp" / "000104.exr").unlink()
-    freeze_shot(trained.shot, ask, quiet())
+    assert sorted(left) == ["000103.exr"]
     assert (folder / "warp" / "000104.exr").is_file()
-    after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
-    assert [name for name in after if after[name] != before[name]] == ["000104.exr"]
+    freeze_shot(trained.shot, ask, quiet())
+    finished, whole = files(folder), files(take[0])
+    assert len(finished) == 9 and all(whole[name] == content for name, content in finished.items())
+    assert all((folder / n).stat().st_mtime_ns == time for n, time in left.items())
+    rows = [json.loads((f / "take.json").read_text())["detail"]["per_frame"] for f in (folder, take[0])]
+    assert rows[0][1:] == rows[1][1:3]
+    assert rows[0][0]["plate_share"] == pytest.approx(rows[1][0]["plate_share"], abs=2e-3)
 
 
 @pytest.mark.parametrize("detail", ["on", "off"])
@@ -172,12 +139,11 @@ def test_a_painted_matte_makes_frames_stale(trained, quiet, detail):
     before = path.read_bytes()
     try:
         keys = []
-        for matte in (None, None, np.full((48, 64), STILL, np.uint8)):
-            if matte is not None:
-                write_matte(path, matte)
+        for _ in range(2):
             freeze_shot(trained.shot, ask, quiet())
             keys.append(read_key(trained.shot.take("painted") / "000110.exr"))
-        assert keys[0] == keys[1] != keys[2]
+            write_matte(path, np.full((48, 64), STILL, np.uint8))
+        assert keys[0] != keys[1]
     finally:
         path.write_bytes(before)
 
@@ -208,7 +174,8 @@ def test_a_ramp_that_runs_is_the_clip(trained, quiet):
 
 @pytest.fixture(scope="module")
 def bright(tmp_path_factory, world, quiet):
-    """Static wall in half-float EXR at twice the size of the solve, with lamps of 50 and values below black."""
+    """(shot, its frame 103, the warp of this frame): a static wall in half-float EXR at twice the size of the solve,
+    with lamps of 50 and values below black."""
     rng = np.random.default_rng(4)
     lamps = [(int(y), int(x)) for y, x in rng.integers(4, 60, (12, 2))]
 
@@ -221,37 +188,30 @@ def bright(tmp_path_factory, world, quiet):
 
     shot = film(world, tmp_path_factory.mktemp("bright"), picture_of, working_height=48)
     train_shot(shot, TrainParams(iterations=60, max_gaussians=900), quiet())
-    return shot
-
-
-def test_light_beyond_white_and_below_black_is_the_plates(bright, quiet):
-    facts = freeze_shot(bright, FreezeParams(t_star=108, first=103, last=104, develop="off"), quiet())
+    facts = freeze_shot(shot, FreezeParams(t_star=108, first=103, last=103, develop="off"), quiet())
     assert (facts["width"], facts["height"]) == (128, 96)
-    for n in (103, 104):
-        source = oiio.ImageBuf(str(bright.root.parent / "source" / f"a.{n}.exr")).get_pixels(oiio.FLOAT)
-        frame = read_frozen_exr(bright.take("freeze") / f"{n:06d}.exr")
-        warp = read_warp(bright.take("freeze") / "warp" / f"{n:06d}.exr")
-        still = warp.matte.numpy() == 1.0
-        assert still.mean() > 0.9 and source[still].max() == 50.0 and source[still].min() < -0.05
-        np.testing.assert_allclose(frame.rgba[..., :3][still], source[still], rtol=1e-3, atol=1e-6)
-        graded = torch.from_numpy(source) * torch.tensor([2.0, 0.5, 1.0])
-        again = apply_warp(graded, warp).numpy()
-        np.testing.assert_allclose(again[still], graded.numpy()[still], rtol=1e-3, atol=1e-6)
+    folder = shot.take("freeze")
+    return shot, read_frozen_exr(folder / "000103.exr"), read_warp(folder / "warp" / "000103.exr")
+
+
+def test_light_beyond_white_and_below_black_is_the_plates(bright):
+    shot, frame, warp = bright
+    source = oiio.ImageBuf(str(shot.root.parent / "source" / "a.103.exr")).get_pixels(oiio.FLOAT)
+    still = warp.matte.numpy() == 1.0
+    assert still.mean() > 0.9 and source[still].max() == 50.0 and source[still].min() < -0.05
+    np.testing.assert_allclose(frame.rgba[..., :3][still], source[still], rtol=1e-3, atol=1e-6)
+    graded = torch.from_numpy(source) * torch.tensor([2.0, 0.5, 1.0])
+    again = apply_warp(graded, warp).numpy()
+    np.testing.assert_allclose(again[still], graded.numpy()[still], rtol=1e-3, atol=1e-6)
 
 
 def test_acescg_footage_is_frozen_in_acescg(bright, quiet):
     """The record declares the footage as ACEScg: frames and warps are written in ACEScg, and stale ones are
     replaced."""
-    ask = FreezeParams(take="aces", t_star=108, first=103, last=103, develop="off", only_missing=True)
-    freeze_shot(bright, ask, quiet())
-    folder = bright.take("aces")
-    plain, plain_warp = read_frozen_exr(folder / "000103.exr"), read_warp(folder / "warp" / "000103.exr")
-    record = json.loads(bright.listing.read_text())
-    bright.listing.write_text(json.dumps({**record, "reading": {**record["reading"], "light": "ap1"}}))
-    try:
-        freeze_shot(bright, ask, quiet())
-    finally:
-        bright.listing.write_text(json.dumps(record))
+    shot, plain, plain_warp = bright
+    folder, record = shot.take("freeze"), json.loads(shot.listing.read_text())
+    shot.listing.write_text(json.dumps({**record, "reading": {**record["reading"], "light": "ap1"}}))
+    freeze_shot(shot, FreezeParams(t_star=108, first=103, last=103, develop="off", only_missing=True), quiet())
     for file, fill in (("000103.exr", plain.rgba[..., :3]), ("warp/000103.exr", plain_warp.fill.numpy())):
         image = oiio.ImageBuf(str(folder / file))
         assert image.spec().getattribute("oiio:ColorSpace") == "lin_ap1_scene"

@@ -1,16 +1,17 @@
 """Frames rendered by several processes equal those of one, also if one is killed; no process is left behind."""
 
 import dataclasses
+import io
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from torch_backend.contract import Cancelled, ExitCode, FreezeParams, JobError, TakeFolder, read_message, write_message
+from torch_backend.contract import Cancelled, FreezeParams, JobError, TakeFolder, working_on
+from torch_backend.freeze.take import frame_process
+from torch_backend.freeze.take import frames as take_frames
 from torch_backend.freeze.take.cameras import in_range
 from torch_backend.freeze.take.folder import make_folders
 from torch_backend.freeze.take.frames import render_frames
@@ -23,7 +24,7 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="on
 
 def opened(shot, take, report):
     """A take that is ready for rendering: (params, take, frames)."""
-    params = FreezeParams(take=take, t_star=104, first=103, last=106)
+    params = FreezeParams(take=take, t_star=105, first=103, last=106)
     plan = planned(shot, params, report)
     make_folders(plan.folder, plan.spec)
     return params, plan, in_range(plan.whole, params)
@@ -61,15 +62,6 @@ def one_process(frozen_shot, quiet):
     return files(take.folder), shares
 
 
-def test_three_processes_write_the_same_bytes(frozen_shot, quiet, one_process):
-    """The next test and the test of a cancel use two processes."""
-    params, take, frames = opened(frozen_shot, "three-processes", quiet())
-    shares = render_side_by_side(frozen_shot, params, take, frames, {103}, quiet(), 3)
-    expected = {name: data for name, data in one_process[0].items() if "000103" not in name}
-    assert files(take.folder) == expected
-    assert sorted(shares) == [104, 105, 106] and all(shares[n].equal(one_process[1][n]) for n in shares)
-
-
 @needs_proc
 def test_what_a_killed_process_leaves_is_rendered_by_its_starter(frozen_shot, quiet, one_process):
     params, take, frames = opened(frozen_shot, "one-killed", quiet())
@@ -83,8 +75,10 @@ def test_what_a_killed_process_leaves_is_rendered_by_its_starter(frozen_shot, qu
                 self.killed = found[0]
 
     report = Killer()
-    render_side_by_side(frozen_shot, params, take, frames, set(), report, 2)
-    assert report.killed and files(take.folder) == one_process[0] and not helpers()
+    shares = render_side_by_side(frozen_shot, params, take, frames, {103}, report, 2)
+    expected = {name: data for name, data in one_process[0].items() if "000103" not in name}
+    assert report.killed and files(take.folder) == expected and not helpers()
+    assert sorted(shares) == [104, 105, 106] and all(shares[n].equal(one_process[1][n]) for n in shares)
 
 
 @needs_proc
@@ -106,8 +100,6 @@ def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(frozen_shot, quiet, on
     assert not helpers()
     left = files(take.folder)
     assert len(left) < len(one_process[0]) and all(one_process[0][name] == data for name, data in left.items())
-    render_side_by_side(frozen_shot, params, take, frames, set(), quiet(), 2)
-    assert files(take.folder) == one_process[0]
 
 
 def test_error_in_one_process_is_reported_like_a_single_process(frozen_shot, quiet):
@@ -127,36 +119,26 @@ def test_error_in_one_process_is_reported_like_a_single_process(frozen_shot, qui
     assert errors[0] == errors[1]
 
 
-RENAMED = """
-import sys
-from pathlib import Path
-from torch_backend.freeze.take import frame_process, frames
-write, shot, moved = frames._write, *map(Path, sys.argv[1:])
-def rename_and_write(*of):
-    if shot.exists():
-        shot.rename(moved)
-    write(*of)
-frames._write = rename_and_write
-sys.exit(frame_process.main())
-"""
-
-
-def test_nothing_is_written_under_the_former_name_of_a_shot_that_was_renamed(frozen_shot, quiet):
+def test_nothing_is_written_under_the_former_name_of_a_shot_that_was_renamed(frozen_shot, quiet, monkeypatch):
+    """What a process renders, in this process."""
     params, take, _ = opened(frozen_shot, "renamed", quiet())
-    moved = frozen_shot.root.with_name("renamed.splannequin")
+    moved, write = frozen_shot.root.with_name("renamed.splannequin"), take_frames._write
     request = {
         "shot": str(frozen_shot.root), "folder": str(take.folder.root), "t_star": take.t_star, "keys": take.all_keys,
         "params": dataclasses.asdict(params), "frames": [103, 104],
     }  # fmt: skip
-    command = [sys.executable, "-c", RENAMED, str(frozen_shot.root), str(moved)]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[4])
+
+    def rename_and_write(*of):
+        if frozen_shot.root.exists():
+            frozen_shot.root.rename(moved)
+        write(*of)
+
+    monkeypatch.setattr(take_frames, "_write", rename_and_write)
     try:
-        write_message(process.stdin, request)
-        said = [header["kind"] for header, _ in iter(lambda: read_message(process.stdout), None)]
-        assert process.wait() != ExitCode.OK and said[-1] == "error"
+        with pytest.raises((JobError, OSError)), working_on(frozen_shot.root):
+            frame_process._render(request, io.BytesIO())
         assert moved.exists() and not frozen_shot.root.exists()
     finally:
-        process.kill()
         shutil.rmtree(frozen_shot.root, ignore_errors=True)
         moved.rename(frozen_shot.root)
 
