@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,23 +20,31 @@ from torch_backend.footage.images import read_png, resize, write_png
 from torch_backend.freeze.exr import read_frozen_exr
 
 CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
+SMALL = ("--width", 160, "--iterations", 200, "--max-gaussians", 3000)
 KEYS = {
     "frames", "registered", "gaussians", "moving_share", "train_seconds", "heldout_psnr_db", "wall_seconds_by_stage",
     "exr_dir", "contact_sheet", "t_star_frame", "verdict", "plate_share", "invented_share",
 }  # fmt: skip
 
 
-def run(*arguments):
-    command = python_child(sys.executable, "torch_backend", *map(str, arguments))
-    environ = {**os.environ, "PYTHONPATH": str(CLIP.parents[1])}
-    return subprocess.run(**command, env=environ, capture_output=True, text=True, check=False)
+@pytest.fixture
+def run(capsys):
+    """run(word, ...): runs a command in this process; returns its exit code and what it prints."""
+
+    def command(*arguments):
+        code, printed = cli.main([*map(str, arguments)]), capsys.readouterr()
+        return SimpleNamespace(returncode=code, stdout=printed.out, stderr=printed.err)
+
+    return command
 
 
 @pytest.fixture(scope="module")
 def frozen(tmp_path_factory):
     output = tmp_path_factory.mktemp("out")
-    done = run("freeze", CLIP, "--output", output, "--first", 1, "--last", 20, "--t-star", 10, "--working-height", 240,
-               "--width", 160, "--iterations", 400, "--max-gaussians", 6000)  # fmt: skip
+    words = ["--first", 1, "--last", 20, "--t-star", 10, "--working-height", 240, *SMALL]
+    command = python_child(sys.executable, "torch_backend", *map(str, ["freeze", CLIP, "--output", output, *words]))
+    environ = {**os.environ, "PYTHONPATH": str(CLIP.parents[1])}
+    done = subprocess.run(**command, env=environ, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return output, json.loads((output / "summary.json").read_text()), done.stdout
 
@@ -70,11 +79,11 @@ def test_frozen_frames_look_like_their_plates(frozen):
     assert np.mean(scores) > 19.0
 
 
-def test_the_same_command_again_only_looks(frozen):
+def test_the_same_command_again_only_looks(frozen, run):
     output, _, _ = frozen
     checkpoint = output / "shot.splannequin" / "runs" / "main" / "checkpoint.safetensors"
     before = checkpoint.stat().st_mtime_ns
-    done = run("train", output / "shot.splannequin", "--width", 160, "--iterations", 400, "--max-gaussians", 6000)
+    done = run("train", output / "shot.splannequin", *SMALL)
     assert done.returncode == 0
     assert "already trained" in done.stdout
     assert checkpoint.stat().st_mtime_ns == before
@@ -114,7 +123,7 @@ def test_a_host_is_known_however_its_file_names_it(tmp_path, line):
     assert host_names(tmp_path) == ("fourth",)
 
 
-def test_export_writes_and_refuses_in_words(world, tmp_path):
+def test_export_writes_and_refuses_in_words(world, tmp_path, run):
     done = run("export", world.shot.root, "--format", "colmap", "--text", "--output", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     written = [tmp_path / "out" / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
@@ -125,7 +134,7 @@ def test_export_writes_and_refuses_in_words(world, tmp_path):
     assert refused.stderr.startswith("Error: ") and "already contains another COLMAP model" in refused.stderr
 
 
-def test_solve_refuses_missing_cameras(world, tmp_path):
+def test_solve_refuses_missing_cameras(world, tmp_path, run):
     shot = tmp_path / "s.splannequin"
     shutil.copytree(world.shot.root, shot)
     listing = shot / "frames" / "frames.json"
@@ -135,7 +144,7 @@ def test_solve_refuses_missing_cameras(world, tmp_path):
     assert (shot / "solve" / "cameras.json").is_file()
 
 
-def test_a_sequences_rate_and_layer_come_from_the_command_line(tmp_path):
+def test_a_sequences_rate_and_layer_come_from_the_command_line(tmp_path, run):
     rng = np.random.default_rng(0)
     wide = np.repeat(np.repeat(rng.random((12, 40, 3)), 4, axis=0), 4, axis=1).astype(np.float32)
     for i in range(10):
@@ -153,7 +162,7 @@ def test_a_sequences_rate_and_layer_come_from_the_command_line(tmp_path):
     assert np.abs(read_png(shot / "frames/raw/000000.png") / 65535 - ROLLED.from_light(wide[:, :64])).max() < 2e-3
 
 
-def test_a_failed_import_leaves_no_empty_shot(tmp_path):
+def test_a_failed_import_leaves_no_empty_shot(tmp_path, run):
     wrong = tmp_path / "text.mp4"
     wrong.write_text("no video")
     (tmp_path / "mine").mkdir()

@@ -31,8 +31,12 @@ def lock_of(shot) -> Path:
     return shot.root / contract.WRITER_FILE
 
 
-def begin_import(shot, last: int = 8) -> tuple[subprocess.Popen[bytes], Path]:
-    folder = job.new_job(shot, "import", contract.ImportParams(source=str(CLIP), first=1, last=last))
+def new_import(shot, last: int = 8) -> Path:
+    return job.new_job(shot, "import", contract.ImportParams(source=str(CLIP), first=1, last=last))
+
+
+def begin_import(shot) -> tuple[subprocess.Popen[bytes], Path]:
+    folder = new_import(shot, 24)
     command = [sys.executable, "-P", "-m", "torch_backend", "run-job", str(folder)]
     return subprocess.Popen(command, stderr=subprocess.PIPE), folder
 
@@ -81,13 +85,13 @@ def test_job_started_right_after_another_waits_for_the_lock(shot):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP is POSIX")
 def test_the_second_job_is_refused_in_words_and_the_first_goes_on(shot):
-    first, one = begin_import(shot, 24)
+    first, one = begin_import(shot)
     try:
         writer = wait_for_lock(shot, first)
         os.kill(first.pid, signal.SIGSTOP)  # keeps it working during the checks
         assert (writer.pid, writer.kind, writer.job) == (first.pid, "import", one.name)
-        second, second_job = begin_import(shot)
-        assert second.wait() == ExitCode.USAGE and second.communicate()
+        second_job = new_import(shot)
+        assert job.run_job(second_job)[0] == ExitCode.USAGE
         status = status_of(second_job)
         assert status.state == "failed" and status.host == contract.computer_name()
         where, since = contract.computer_name().partition(" (")[0], time.strftime("%H:", time.localtime(writer.since))
@@ -103,13 +107,13 @@ def test_the_second_job_is_refused_in_words_and_the_first_goes_on(shot):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")
 def test_what_a_killed_job_holds_is_taken_over(shot):
-    first, _ = begin_import(shot, 24)
+    first, _ = begin_import(shot)
     wait_for_lock(shot, first)
     first.kill()
     first.communicate()
     assert lock_of(shot).exists()
-    second, folder = begin_import(shot)
-    assert second.communicate() and second.returncode == ExitCode.OK, status_of(folder).message
+    folder = new_import(shot)
+    assert job.run_job(folder)[0] == ExitCode.OK, status_of(folder).message
     assert not lock_of(shot).exists() and len(list(shot.frames.glob("raw/*.png"))) == 8
 
 
@@ -214,7 +218,7 @@ random.seed(seed)
 sys.stdin.read()  # all begin at once, and none spins: two that do can keep the fourth from ever being started
 held = 0
 until = time.monotonic() + 60
-while held < 60 and time.monotonic() < until:
+while held < 20 and time.monotonic() < until:
     try:
         with only_writer(root, "train", f"{seed}"):
             os.close(os.open(mark, os.O_CREAT | os.O_EXCL))  # fails if two are inside
@@ -243,7 +247,7 @@ def test_of_all_who_take_a_dead_ones_place_one_gets_it(shot, tmp_path):
     os.close(gate)
     os.close(opens)
     outputs = [child.communicate() for child in crowd]
-    assert [errors for _, errors in outputs] == [""] * 4 and [printed for printed, _ in outputs] == ["60\n"] * 4
+    assert [errors for _, errors in outputs] == [""] * 4 and [printed for printed, _ in outputs] == ["20\n"] * 4
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps a folder that a process works in where it is")
@@ -274,8 +278,7 @@ def test_an_import_into_a_shot_that_goes_leaves_nothing_in_its_place(shot, tmp_p
             super().progress(stage, done, total, message)
 
     monkeypatch.setattr(job, "JobReporter", Goes)
-    folder = job.new_job(shot, "import", contract.ImportParams(source=str(CLIP), first=1, last=8))
-    heard = []
+    folder, heard = new_import(shot), []
     assert job.run_job(folder, heard.append) == (ExitCode.USAGE, None)
     assert heard[-2].data["message"].startswith("The import stopped: the shot folder") and not shot.root.exists()
 

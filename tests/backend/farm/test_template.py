@@ -190,9 +190,7 @@ def test_task_arguments_survive_special_characters(shot, requests):
     assert json.loads(data)["freeze"]["t_star_per_frame"] == {odd: 1.0}
 
 
-@pytest.mark.parametrize(
-    "name", ["a}}b", "a{{b", "{{Param.Home}}", "t\tab", "x\x85", "no utf\udcff", "deep" * 60 + "/" + "er" * 120]
-)
+@pytest.mark.parametrize("name", ["a}}b", "{{Param.Home}}", "t\tab", "no utf\udcff", "deep" * 60 + "/" + "er" * 120])
 @pytest.mark.parametrize("what", ["shot", "output", "mask"])
 def test_a_path_that_the_engine_refuses_is_one_sentence_at_export(imported, tmp_path, capsys, name, what):
     """Output folders and masks are parameter values, where braces have no meaning."""

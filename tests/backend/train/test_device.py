@@ -1,14 +1,11 @@
 """A run stays on one device: checks that work without a GPU, and runs on a GPU if there is one."""
 
 import sys
-from pathlib import Path
 
 import pytest
 import torch
-from torch.overrides import TorchFunctionMode
-from torch.utils._device import _device_constructors
 
-import torch_backend
+from tests.backend.train import devices
 from tests.backend.trainings import take_steps
 from torch_backend.contract import FreezeParams, JobError, TrainParams
 from torch_backend.freeze import freeze_shot
@@ -18,49 +15,15 @@ from torch_backend.train.device import cuda_refusal, decide_device
 from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
 
-ROOT = Path(torch_backend.__file__).parent
-STATIONS = [str(ROOT / name) for name in ("train", "gaussians", "deformation", "supervision", "freeze")]
 needs_gpu = pytest.mark.skipif(bool(cuda_refusal()), reason="no GPU")
 
 
-class NamedDevices(TorchFunctionMode):
-    """Records each call in a station that creates a tensor without a device."""
-
-    def __init__(self):
-        super().__init__()
-        self.found = set()
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        kwargs = kwargs or {}
-        if func in _device_constructors() and kwargs.get("device") is None:
-            frame = sys._getframe(1)
-            while frame and "/torch/" in frame.f_code.co_filename.replace("\\", "/"):
-                frame = frame.f_back
-            if frame and frame.f_code.co_filename.startswith(tuple(STATIONS)):
-                self.found.add(f"{frame.f_code.co_filename}:{frame.f_lineno} {func.__name__}")
-        return func(*args, **kwargs)
-
-
 def test_checker_finds_tensors_created_without_a_device(monkeypatch):
-    monkeypatch.setattr(sys.modules[__name__], "STATIONS", [__file__])
-    with NamedDevices() as mode:
+    monkeypatch.setattr(devices, "STATIONS", [__file__])
+    with devices.NamedDevices() as mode:
         torch.zeros(3, device="cpu")
         torch.zeros(2)
     assert len(mode.found) == 1
-
-
-@pytest.mark.parametrize(
-    ("method", "supervision"),
-    [("auto", "support"), ("hexplane", "paper"), ("mlp", "paper"), ("control_points", "support")],
-)
-def test_every_tensor_is_created_on_a_named_device(world, quiet, method, supervision):
-    name = f"named-{method}"
-    params = TrainParams(run=name, iterations=60, max_gaussians=1500, method=method, supervision=supervision)
-    with NamedDevices() as mode:
-        train_shot(world.shot, params, quiet())
-        develop = "on" if method == "auto" else "off"  # developing does not depend on the method
-        freeze_shot(world.shot, FreezeParams(run=name, take=name, first=101, last=102, develop=develop), quiet())
-    assert mode.found == set()
 
 
 def test_choice_of_device():
@@ -85,11 +48,11 @@ def test_a_card_that_is_not_used_is_said_at_the_start_of_training(world, quiet, 
         choose_device("cuda")
     assert refused.value.hint.startswith("Update the NVIDIA driver")
     report = quiet()
-    train_shot(world.shot, TrainParams(run="unused-card", iterations=20, max_gaussians=1500), report)
+    train_shot(world.shot, TrainParams(run="unused-card", iterations=10, max_gaussians=300), report)
     said = [event for event in report.events if event[0] == "warning" and "RTX 3090" in event[1]]
     assert len(said) == 1 and "driver 535.183.01, and R580" in said[0][1] and "Update" in said[0][2]
     silent = quiet()
-    train_shot(world.shot, TrainParams(run="by-wish", iterations=20, max_gaussians=1500, device="cpu"), silent)
+    train_shot(world.shot, TrainParams(run="by-wish", iterations=10, max_gaussians=300, device="cpu"), silent)
     assert not [event for event in silent.events if event[0] == "warning" and "RTX 3090" in event[1]]
 
 

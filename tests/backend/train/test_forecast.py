@@ -73,7 +73,7 @@ def test_smaller_preset_with_equal_pictures_is_reported():
 def test_a_long_run_says_how_long_it_takes_before_it_has_begun_in_earnest_and_when_it_goes_on(world, quiet):
     for resumed in (False, True):
         report = quiet(cancel_at=("training", (60 if resumed else 30) / 10**7))
-        params = TrainParams(run="long", preset="standard", iterations=10**7, max_gaussians=1500, width=32)
+        params = TrainParams(run="long", preset="standard", iterations=10**7, max_gaussians=300, width=32)
         with pytest.raises(Cancelled):
             train_shot(world.shot, params, report)
         (left,) = (event[2]["seconds_left"] for event in report.events if event[:2] == ("metric", FORECAST))
@@ -86,7 +86,7 @@ def test_a_long_run_says_how_long_it_takes_before_it_has_begun_in_earnest_and_wh
 def test_a_short_run_is_silent_but_for_the_figure(world, quiet):
     report = quiet(cancel_at=("training", 60 / 240))
     with pytest.raises(Cancelled):
-        train_shot(world.shot, TrainParams(run="short", iterations=240, max_gaussians=1500), report)
+        train_shot(world.shot, TrainParams(run="short", iterations=240, max_gaussians=300), report)
     metrics = [event[2] for event in report.events if event[:2] == ("metric", FORECAST)]
     assert len(metrics) == 2, "again after every measurement on frames held out"
     assert all(row["of"] == "training" and 0 < row["seconds_left"] < 600 for row in metrics)

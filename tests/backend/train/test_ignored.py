@@ -56,7 +56,7 @@ def shown_behind(world, quiet, ignored):
     images = load_images(scene, scene.solved, WIDTH, HEIGHT)
     found = load_ignored(masks_of(world), scene, scene.solved, WIDTH, HEIGHT) if ignored else {}
     trainer = Trainer(scene, images, scene.solved, config, quiet(), ignored=found)
-    take_steps(trainer, 150)
+    take_steps(trainer, 100)
     mask = torch.from_numpy(LOGO)
     return trainer.render_frame(8)[mask], world.image(8, 8 / (FRAMES - 1))[mask]
 
@@ -70,7 +70,7 @@ def test_a_masked_logo_is_not_learnt(logo_world, quiet):
 
 
 def test_a_run_is_known_by_what_it_ignores(logo_world, quiet):
-    params = TrainParams(iterations=20, max_gaussians=300, method="static")
+    params = TrainParams(iterations=10, max_gaussians=300, method="static")
     key = train_shot(logo_world.shot, params, quiet())["key"]
     assert train_shot(logo_world.shot, params, quiet())["key"] == key
     record = read_json(logo_world.shot.solve_record)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world, paint_motion
-from tests.backend.trainings import assert_same_run, short, take_steps
+from tests.backend.trainings import assert_same_run, take_steps
 from torch_backend.contract import Cancelled, JobError, TrainParams
 from torch_backend.deformation import GateConfig
 from torch_backend.motion.mattes import MOVING, PAINTED, STILL, UNKNOWN, load_motion, write_matte
@@ -113,42 +113,36 @@ def test_when_growth_of_a_long_run_ends_who_is_open_and_paints_no_mover_closes(p
         torch.testing.assert_close(model.gaussians.params[name][strays], value, msg=name)
 
 
-def test_where_the_mattes_say_that_nothing_moves_nothing_opens(tmp_path, quiet):
-    world = build_world(tmp_path)
-    paint_all(world, UNKNOWN)
-    summary = train_shot(world.shot, short("still"), quiet())
-    assert summary["moving_share"] == 0.0
-    assert load_run(world.shot, "still").model.field is None
-
-
 def test_published_hosts_ignore_movers(painted_world, quiet):
     for changes in ({"method": "hexplane"}, {"host_config": "reference"}):
         assert trainer_of(painted_world, quiet, 0, **changes).movers is None
     assert trainer_of(painted_world, quiet, 0, method="static").movers is not None
 
 
-def test_a_run_is_known_by_its_mattes(tmp_path, quiet):
-    world = build_world(tmp_path)
+def test_a_run_is_known_by_its_mattes_and_nothing_opens_where_they_say_that_nothing_moves(tmp_path, quiet):
+    world, params = build_world(tmp_path), TrainParams(iterations=40, max_gaussians=600)
     paint_motion(world)
-    train_shot(world.shot, short("main"), quiet())
+    train_shot(world.shot, params, quiet())
     again = quiet()
-    train_shot(world.shot, short("main"), again)
+    train_shot(world.shot, params, again)
     assert ("progress", "training", 1, 1, "already trained") in again.events
     paint_all(world, UNKNOWN)
     with pytest.raises(JobError, match="other motion mattes"):
-        train_shot(world.shot, TrainParams(run="main", extend=10), quiet())
+        train_shot(world.shot, TrainParams(extend=10), quiet())
     later = quiet()
-    summary = train_shot(world.shot, short("main"), later)
+    summary = train_shot(world.shot, params, later)
     assert any("motion mattes changed" in event[1] for event in later.events if event[0] == "warning")
     assert summary["moving_share"] == 0.0
+    assert load_run(world.shot, "main").model.field is None
 
 
 def test_it_resumes_exactly_with_mattes(painted_world, quiet):
-    train_shot(painted_world.shot, short("whole"), quiet())
+    whole, broken = (TrainParams(run=run, iterations=40, max_gaussians=600) for run in ("whole", "broken"))
+    train_shot(painted_world.shot, whole, quiet())
     for share in (0.3, 0.7):  # static; with a field
         with pytest.raises(Cancelled):
-            train_shot(painted_world.shot, short("broken"), quiet(cancel_at=("training", share)))
-    train_shot(painted_world.shot, short("broken"), quiet())
+            train_shot(painted_world.shot, broken, quiet(cancel_at=("training", share)))
+    train_shot(painted_world.shot, broken, quiet())
     runs = [painted_world.shot.run(name) for name in ("whole", "broken")]
     assert_same_run(*runs)
     tensors, facts = load_checkpoint(runs[0] / "checkpoint.safetensors")

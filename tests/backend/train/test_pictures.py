@@ -97,7 +97,7 @@ def test_a_frame_that_cannot_be_read_is_named_whichever_thread_finds_it(shot, qu
 
 
 def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(shot, quiet, monkeypatch):
-    train_params = TrainParams(run="f", preset="final", iterations=120, max_gaussians=1500)
+    train_params = TrainParams(run="f", preset="final", iterations=20, max_gaussians=300)
     scene, card = load_scene(shot), torch.device("cuda")
     with pytest.raises(Cancelled):
         train_shot(shot, train_params, quiet(cancel_at=("training", 0.1)))

@@ -46,13 +46,14 @@ class Again:
         return lambda: result.copy_(work()), result
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def trained(world, quiet):
     scene = load_scene(world.shot)
     images = load_images(scene, scene.solved, 32, 24)
 
     def run(recording, steps=24, break_at=-1, method="hexplane", targets=None):
         config = config_from_params(TrainParams(iterations=40, max_gaussians=330, method=method, width=32))
+        config.field.resolution = 16  # a step takes a third of the time
         config.densify.every, config.init.seeds, config.field.start, config.densify.start = 10, 0, 0.1, 0.2
         trainer = Trainer(scene, images, scene.solved, config, quiet(), {}, "cpu")
         trainer.targets = targets
@@ -67,6 +68,12 @@ def trained(world, quiet):
         return trainer
 
     return run
+
+
+@pytest.fixture(scope="module")
+def plain(trained):
+    """A run without recordings; tests must not change it."""
+    return trained(None)
 
 
 def equal(one, two):
@@ -85,14 +92,14 @@ class EveryOther:
         return None if frame % 2 else torch.stack([wanted, torch.full_like(wanted, 0.01)])
 
 
-def test_depth_maps_reach_a_replayed_step_with_its_facts(trained):
-    plain, recorded = trained(None, targets=EveryOther()), trained(Again(), targets=EveryOther())
-    assert equal(plain, recorded) and not equal(plain, trained(None))
+def test_depth_maps_reach_a_replayed_step_with_its_facts(trained, plain):
+    launched, recorded = trained(None, targets=EveryOther()), trained(Again(), targets=EveryOther())
+    assert equal(launched, recorded) and not equal(launched, plain)
     assert {kind.depth for kind, _ in recorded.recorder._seen} == {True, False}
 
 
-def test_a_kind_is_launched_once_and_then_replayed_until_growth(trained):
-    plain, recording = trained(None), Again()
+def test_a_kind_is_launched_once_and_then_replayed_until_growth(trained, plain):
+    recording = Again()
     recorded = trained(recording)
     assert equal(plain, recorded)
     kinds = {kind for kind, _ in recorded.recorder._seen}
@@ -108,8 +115,7 @@ def test_while_nothing_moves_a_kind_is_recorded_once(trained):
     assert recording.recorded <= len(recorder._seen) < 5 and recording.dropped == 0, "a kind has other harmonics"
 
 
-def test_a_run_goes_on_where_a_recording_fails_or_finds_no_room(trained):
-    plain = trained(None)
+def test_a_run_goes_on_where_a_recording_fails_or_finds_no_room(trained, plain):
     failed = trained(Again(fails=True))
     assert failed.recorder.refused == "operation not permitted when stream is capturing"
     assert failed.recorder.replayed == 0 and equal(plain, failed)
@@ -117,8 +123,8 @@ def test_a_run_goes_on_where_a_recording_fails_or_finds_no_room(trained):
     assert full.recorder.refused == "" and full.recorder.replayed == 0 and equal(plain, full)
 
 
-def test_a_recording_that_found_too_little_room_is_tried_again(trained):
-    plain, recording = trained(None), Again(short=2)
+def test_a_recording_that_found_too_little_room_is_tried_again(trained, plain):
+    recording = Again(short=2)
     recorded = trained(recording)
     assert recorded.recorder.refused == "" and recorded.recorder.replayed > 0 and equal(plain, recorded)
     assert recording.short < 0 and recording.dropped >= 2
@@ -126,10 +132,10 @@ def test_a_recording_that_found_too_little_room_is_tried_again(trained):
     assert "too little memory" in never.recorder.refused and never.recorder.recording.short == 96
 
 
-def test_a_longer_list_of_hits_is_recorded_anew(trained, monkeypatch):
+def test_a_longer_list_of_hits_is_recorded_anew(trained, plain, monkeypatch):
     rooms = [100] * 9 + [200] * 999  # for example, a held-out frame needs more
     monkeypatch.setattr("torch_backend.train.recorder.listed", lambda *_: rooms.pop(0))
-    plain, recording = trained(None), Again()
+    recording = Again()
     recorded = trained(recording)
     assert equal(plain, recorded) and len(rooms) < 999
     assert {entry.listed for entry in recorded.recorder._recorded.values()} == {200}

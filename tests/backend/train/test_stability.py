@@ -19,23 +19,30 @@ from torch_backend.train.repair import drop_displaced, repair
 from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
 
-HOSTS = METHODS[:-1]
 NAN = math.nan
 RATES = ("lr", "lr_start", "lr_end")
 
 
-@pytest.fixture
-def begin(world, quiet):
-    """begin(method, steps): trainer on the tiny world after that many steps; the field is added after 20 of 60."""
+@pytest.fixture(scope="module")
+def begin(world, quiet, tmp_path_factory):
+    """begin(method, steps): trainer on the tiny world after that many steps; the field is added after 20 of 60.
+
+    The steps are only taken once.
+    """
+    scene, folder = load_scene(world.shot), tmp_path_factory.mktemp("begun")
+    pictures = load_images(scene, scene.solved, 64, 48)
 
     def make(method="hexplane", steps=25, **changes) -> Trainer:
-        scene = load_scene(world.shot)
         config = configuration(method, 0, iterations=60, **changes)
         if config.host == "hexplane":
             config.field.resolution = 16  # a step takes a third of the time
-        trainer = Trainer(scene, load_images(scene, scene.solved, 64, 48), scene.solved, config, quiet())
-        go_on(trainer, steps)
-        assert not warnings(trainer)
+        trainer, begun = Trainer(scene, pictures.clone(), scene.solved, config, quiet()), folder / f"{method}-{steps}"
+        if begun.is_file():
+            restore_run(trainer, begun)
+        elif steps:
+            go_on(trainer, steps)
+            assert not warnings(trainer)
+            save_run(trainer, begun)
         return trainer
 
     return make
@@ -78,18 +85,19 @@ def gaussian(name, value, row=7):
     return poison
 
 
-def without_length(trainer):
-    """Also without momentum, which would rotate it."""
-    p = trainer.model.gaussians.params["quats"]
-    p.data[7] = trainer.optimizer.state[p]["exp_avg"][7] = 0.0
+def of_everything(trainer):
+    """The quaternion also loses its momentum, which would rotate it."""
+    for name, value, row in (
+        ("means", torch.tensor([NAN, 0.0, 1.0]), 7), ("log_scales", torch.tensor([math.inf, -3.0, -3.0]), 8),
+        ("opacity_logits", NAN, 9), ("sh0", NAN, 10), ("shN", NAN, slice(11, 13)), ("quats", 0.0, 14),
+    ):  # fmt: skip
+        gaussian(name, value, row)(trainer)
+    trainer.optimizer.state[trainer.model.gaussians.params["quats"]]["exp_avg"][14] = 0.0
+    trainer.model.exposure.values.data[4, 0, 1] = math.inf
 
 
 def of_the_field(trainer):
     dict(trainer.model.field.named_parameters())["trunk.weight"].data[3, 2] = NAN
-
-
-def of_the_exposure(trainer):
-    trainer.model.exposure.values.data[4, 0, 1] = math.inf
 
 
 def of_a_moment(trainer):
@@ -102,18 +110,16 @@ def of_a_moment(trainer):
 @pytest.mark.parametrize(
     ("poison", "words"),
     [
-        (gaussian("means", torch.tensor([NAN, 0.0, 1.0])), "dropped 1 Gaussian (means not finite)"),
-        (gaussian("log_scales", torch.tensor([math.inf, -3.0, -3.0])), "dropped 1 Gaussian (log_scales not finite)"),
-        (gaussian("opacity_logits", NAN), "dropped 1 Gaussian (opacity_logits not finite)"),
-        (gaussian("sh0", NAN), "dropped 1 Gaussian (sh0 not finite)"),
-        (gaussian("shN", NAN, row=slice(7, 9)), "dropped 2 Gaussians (shN not finite)"),
-        (without_length, "repaired 1 Gaussian (quats without length)"),
+        (
+            of_everything,
+            "dropped 6 Gaussians (means, log_scales, opacity_logits, sh0, shN not finite), "
+            "repaired 1 Gaussian (quats without length), repaired 1 number of exposure",
+        ),
         (of_the_field, "repaired 1 number of trunk.weight"),
-        (of_the_exposure, "repaired 1 number of exposure"),
         (of_a_moment, "cleared 1 moment of Adam"),
     ],
 )
-def test_one_bad_number_is_named_and_the_run_goes_on(begin, poison, words):
+def test_bad_numbers_are_named_and_the_run_goes_on(begin, poison, words):
     trainer = begin("hexplane" if poison is of_the_field else "static")
     before = float(torch.tensor(go_on(trainer, 5)).mean())
     count = len(trainer.model.gaussians)
@@ -180,7 +186,7 @@ def test_a_frame_with_bad_pixels_is_left_out_from_then_on(begin, supervision):
     go_on(trainer, 19)
     (said,) = warnings(trainer)
     assert f"excluded frame {trainer.scene.frames[trainer.train_ids[5]]} from the training" in said
-    assert len(go_on(trainer, 40)) == 40  # with `paper`, some of these steps use a second frame
+    assert len(go_on(trainer, 25)) == 25  # with `paper`, some of these steps use a second frame
     assert len(warnings(trainer)) == 1
     assert finite(trainer)
     assert len(trainer.model.gaussians) >= 0.9 * count
@@ -199,7 +205,7 @@ def test_a_bad_frame_does_not_keep_the_gate_shut(begin):
     assert finite(trainer)
 
 
-@pytest.mark.parametrize("host", HOSTS)
+@pytest.mark.parametrize("host", ["hexplane", "control_points"])
 def test_a_field_that_throws_gaussians_out_of_their_place_is_put_back(begin, host):
     """One step at 100,000 times the learning rates: Gaussians outside the picture have no gradient to return by."""
     trainer = begin(host, 30)
@@ -360,7 +366,7 @@ def test_a_field_that_joins_sooner_starts_at_the_rates_of_a_third_of_the_run():
     assert rates["final"] == pytest.approx([3e-2 * third, 1e-3 * third, 3e-3, 1e-4])
 
 
-@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh0", "shN"])
+@pytest.mark.parametrize("name", ["means", "log_scales", "opacity_logits"])
 def test_large_step_of_one_attribute_recovers(begin, name):
     trainer = begin("static", 20)
     loss = float(torch.tensor(go_on(trainer, 10)).mean())
@@ -441,19 +447,20 @@ def test_too_much_to_repair_ends_in_words(begin):
         trainer.inspect_nonfinite()
 
 
-def test_whole_runs_of_every_host_stay_finite_and_alike(world):
+def test_whole_runs_stay_finite_and_alike(world):
+    methods = METHODS[2:]
     scene = load_scene(world.shot)
     outcomes = []
-    for method in METHODS:
+    for method in methods:
         for seed in range(2):
             config = configuration(method, seed, iterations=60)
-            if config.host == "hexplane":
+            if method == "auto":
                 config.field.resolution = 16
             outcomes.append(train_once(scene, config))
     for outcome in outcomes:
         assert outcome.psnr_db is not None
         assert (outcome.finite, outcome.skipped_steps, outcome.warnings) == (True, 0, [])
-    for method in METHODS:
+    for method in methods:
         values = [outcome.psnr_db for outcome in outcomes if outcome.method == method]
         assert min(values) > 18.0
         assert max(values) - min(values) < 3.0

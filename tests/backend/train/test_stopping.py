@@ -158,32 +158,48 @@ def test_what_harmonics_gained_is_scaled_by_what_they_may_still_learn(rates_end)
         assert lasting(since, now, rates_end) == pytest.approx(share, rel=0.01)
 
 
-def test_a_degree_that_gains_too_little_is_dropped_for_good(long_world, quiet, tmp_path):
+@pytest.fixture(scope="module")
+def free(long_world, quiet, tmp_path_factory):
+    """A run that gains enough of everything."""
+    changes = {f"needs__{name}_gain": -1e9 for name in ("sh", "growth", "stop")}
+    return finish(
+        trainer_of(long_world, quiet, init__seeds=0, densify__every=5, **changes), tmp_path_factory.mktemp("free")
+    )
+
+
+@pytest.fixture(scope="module")
+def bound(long_world, quiet, tmp_path_factory):
+    """(run that gains too little of everything, its folder)."""
+    changes, folder = (
+        {f"needs__{name}_gain": 1e9 for name in ("sh", "growth", "stop")},
+        tmp_path_factory.mktemp("bound"),
+    )
+    return finish(trainer_of(long_world, quiet, init__seeds=0, densify__every=5, **changes), folder), folder
+
+
+def test_a_degree_that_gains_too_little_is_dropped_for_good(long_world, free, bound):
     """Dropped coefficients are absent from the checkpoint too, and the rest can be frozen."""
-    trainer = finish(trainer_of(long_world, quiet, needs__sh_gain=1e9), tmp_path)
+    trainer, folder = bound
     assert trainer.model.sh_degree == 0
     assert trainer.policy.degrees.keys() == {1}
     rows = {row["what"]: row for row in modelled(trainer)}
     assert rows["SH degree 1"]["detail"] == "dropped"
     assert rows["SH degree 1"]["gain_db"] == pytest.approx(trainer.policy.degrees[1], abs=1e-3)
-    model = restore_model(*load_checkpoint(tmp_path / "checkpoint.safetensors"), trainer.config)
+    model = restore_model(*load_checkpoint(folder / "checkpoint.safetensors"), trainer.config)
     assert model.gaussians.params["shN"].shape[1] == 0
     scene = long_world[0]
     image = render_frozen(freeze_at(model, 0.5, 2.0), scene.viewmats[9], scene.camera_at(64, 48)[9], 64, 48)
     assert float(image.alpha.mean()) > 0.9
-    kept = finish(trainer_of(long_world, quiet, needs__sh_gain=-1e9), tmp_path)
-    assert kept.model.sh_degree == 2
+    assert free.model.sh_degree == 2
 
 
-def test_growth_ends_when_it_gains_too_little(long_world, quiet, tmp_path):
-    changes = {"init__seeds": 0, "densify__budget": 1200, "iterations": 200}
-    free = finish(trainer_of(long_world, quiet, needs__growth_gain=-1e9, **changes), tmp_path)
+def test_growth_ends_when_it_gains_too_little(free, bound):
     assert free.policy.growth_ended is None
     assert len(free.model.gaussians) > 1000
-    bound = finish(trainer_of(long_world, quiet, needs__growth_gain=1e9, **changes), tmp_path)
-    assert 0 < bound.policy.growth_ended < 0.6 * 200
-    at_end = dict((i, n) for i, n, _ in bound.policy.measured)[bound.policy.growth_ended]
-    assert len(bound.model.gaussians) <= at_end < 1000
+    policy = bound[0].policy
+    assert 0 < policy.growth_ended < 0.6 * 100
+    at_end = dict((i, n) for i, n, _ in policy.measured)[policy.growth_ended]
+    assert len(bound[0].model.gaussians) <= at_end < 1000
 
 
 def test_growth_is_not_judged_while_a_field_is_on_trial(long_world, quiet):
@@ -269,8 +285,8 @@ def test_stopping_facts_load_from_older_versions():
     assert RunFacts.from_json({**facts.to_json(), "poses_gain_db": None, "of_another_version": 1}) == facts
 
 
-def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
-    trainer = finish(trainer_of(long_world, quiet, needs__stop_gain=1e9), tmp_path)
+def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, free, bound):
+    trainer, folder = bound
     assert trainer.policy.stopped == 80  # first measurement after the gate has stopped waiting for motion
     assert trainer.iteration == 90
     group = trainer.optimizer.param_groups[0]
@@ -279,12 +295,11 @@ def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     assert trainer.report.events[-1][2:4] == (90, 90)
     end = modelled(trainer)[-1]
     assert end["detail"] == "stopped at step 90 of 100: nothing more was gained"
-    again = trainer_of(long_world, quiet, needs__stop_gain=1e9)
-    restore_run(again, tmp_path / "checkpoint.safetensors")
+    again = trainer_of(long_world, quiet, densify__every=5)
+    restore_run(again, folder / "checkpoint.safetensors")
     assert again.end == 90
-    on = finish(trainer_of(long_world, quiet, needs__stop_gain=-1e9), tmp_path)
-    assert on.policy.stopped is None
-    assert on.iteration == 100
+    assert free.policy.stopped is None
+    assert free.iteration == 100
 
 
 @pytest.mark.parametrize(("softened", "stopped"), [(0.0, 30), (0.5, 70)])
@@ -300,9 +315,9 @@ def test_no_end_is_looked_for_while_pictures_are_soft_nor_across_their_end(softe
 def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
     changes = {"init__seeds": 0, "needs__growth_gain": 0.5, "needs__stop_gain": 0.5}
     whole = finish(trainer_of(long_world, quiet, **changes), tmp_path)
-    for stop in (45, 72):
-        broken = trainer_of(long_world, quiet, **changes)
-        take_steps(broken, stop)
+    broken = trainer_of(long_world, quiet, **changes)
+    for steps in (45, 27):
+        take_steps(broken, steps)
         save_run(broken, tmp_path / "broken.safetensors")
         resumed = trainer_of(long_world, quiet, **changes)
         restore_run(resumed, tmp_path / "broken.safetensors")
@@ -326,9 +341,10 @@ def test_published_hosts_are_not_stopped_early(long_world, quiet):
         assert trainer_of(long_world, quiet, method=method).policy.excluded == set(probe_frames(len(scene.solved), 12))
 
 
-def test_time_nodes_follow_the_motion(long_world, quiet, tmp_path):
+def test_time_nodes_follow_the_motion(long_world, quiet):
     """One sway over a clip of 30 frames; half of the number of frames would be 15 nodes."""
-    trainer = finish(trainer_of(long_world, quiet, iterations=300, needs__sh_gain=1e9), tmp_path)
+    trainer = trainer_of(long_world, quiet, iterations=300, needs__sh_gain=1e9)
+    take_steps(trainer, 61)  # the field joins at a fifth of the run
     assert trainer.model.field is not None
     nodes = trainer.policy.facts.time_nodes
     assert 4 <= nodes <= 12

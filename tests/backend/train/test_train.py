@@ -5,15 +5,17 @@ import json
 import math
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 import torch_backend.scene
-from tests.backend.conftest import build_world
+from tests.backend.train.devices import NamedDevices
 from tests.backend.trainings import assert_same_run, short
-from torch_backend.contract import Cancelled, ExitCode, JobError, TrainParams
+from torch_backend.contract import Cancelled, ExitCode, FreezeParams, JobError, TrainParams
+from torch_backend.freeze import freeze_shot
 from torch_backend.gaussians import PARAM_NAMES
 from torch_backend.scene import load_images, load_scene
 from torch_backend.shot import Shot, write_json
@@ -45,17 +47,16 @@ def test_the_gate_opens_for_the_patch_that_moves(trained):
     assert float(near.float().mean()) > 0.8
 
 
-def test_frames_beyond_memory_train_identically_from_a_hidden_file(world, quiet, monkeypatch):
-    train_shot(world.shot, short("held"), quiet())
+def test_frames_beyond_memory_train_identically_from_a_hidden_file(world, quiet, monkeypatch, master):
     monkeypatch.setattr(torch_backend.scene, "IMAGE_MEMORY_BYTES", 0)
     scene, folder = load_scene(world.shot), world.shot.run("mapped")
     train_shot(world.shot, short("mapped"), quiet())
-    from_file, _ = load_checkpoint(world.shot.run("held") / "checkpoint.safetensors")
+    from_file, _ = load_checkpoint(master / "checkpoint.safetensors")
     mapped, _ = load_checkpoint(folder / "checkpoint.safetensors")
     assert all(torch.equal(value, mapped[name]) for name, value in from_file.items())
     images = load_images(scene, scene.solved, 64, 48, folder=folder)
     assert torch.equal(images, load_images(scene, scene.solved, 64, 48))
-    assert {path.name for path in folder.iterdir()} == {path.name for path in world.shot.run("held").iterdir()}
+    assert {path.name for path in folder.iterdir()} == {path.name for path in master.iterdir()}
     maps = Path("/proc/self/maps")
     if maps.is_file():
         assert any(str(folder) in line for line in maps.read_text().splitlines()), "else they are held in memory"
@@ -68,28 +69,11 @@ def test_frames_that_no_disk_holds_are_refused_in_a_sentence(world, monkeypatch)
         load_images(scene, scene.solved, 1_000_000, 1_000_000, folder=world.shot.root)
 
 
-def test_cancel_and_resume_end_exactly_where_an_unbroken_run_does(world, quiet):
-    train_shot(world.shot, short("whole"), quiet())
-    with pytest.raises(Cancelled):
-        train_shot(world.shot, short("broken"), quiet(cancel_at=("training", 0.5)))
-    _, meta = load_checkpoint(world.shot.run("broken") / "checkpoint.safetensors")
-    assert 30 <= meta["iteration"] < 60
-    train_shot(world.shot, short("broken"), quiet())
-    assert_same_run(world.shot.run("whole"), world.shot.run("broken"))
-
-
-def test_a_finished_run_is_not_trained_again(world, quiet):
-    train_shot(world.shot, short("once"), quiet())
-    report = quiet()
-    train_shot(world.shot, short("once"), report)
-    assert ("progress", "training", 1, 1, "already trained") in report.events
-
-
 @pytest.mark.parametrize(
     ("method", "supervision", "more"),
     [
         ("static", "none", {}),
-        ("auto", "paper", {}),
+        ("auto", "paper", {"host": "mlp"}),
         ("hexplane", "paper", {"detector": "weight"}),
         ("hexplane", "support", {"host_config": "reference"}),
         ("mlp", "paper", {"detector": "grad_signed"}),
@@ -98,10 +82,16 @@ def test_a_finished_run_is_not_trained_again(world, quiet):
         ("control_points", "paper", {"host_config": "reference"}),
     ],
 )
-def test_every_method_and_preset_of_supervision_runs(world, quiet, method, supervision, more):
+def test_every_method_and_preset_of_supervision_runs(world, quiet, tmp_path, method, supervision, more):
+    """Every tensor is created on a named device."""
     name = "-".join(["m", method, supervision, *more.values()])
-    report = quiet()
-    summary = train_shot(world.shot, short(name, method=method, supervision=supervision, **more), report)
+    report, options = quiet(), {"method": method, "supervision": supervision, **more}
+    with NamedDevices() as mode:
+        summary = train_shot(world.shot, TrainParams(run=name, iterations=30, max_gaussians=400, **options), report)
+        if method == "auto":
+            shot = Shot(shutil.copytree(world.shot.root, tmp_path / "s.splannequin"))  # a freeze adds mattes
+            freeze_shot(shot, FreezeParams(run=name, first=101, last=101, develop="on"), quiet())
+    assert mode.found == set()
     assert math.isfinite(summary["heldout_psnr_db"])
     assert not [e for e in report.events if e[0] == "warning" and "skipped" in e[1]]
     assert summary["host_config"] == more.get("host_config", "default")
@@ -115,7 +105,8 @@ def test_every_method_and_preset_of_supervision_runs(world, quiet, method, super
 
 @pytest.mark.parametrize("host", ["hexplane", "control_points"])
 def test_state_can_be_evaluated_without_canonical_gradients(world, quiet, host):
-    train_shot(world.shot, short(f"pull-{host}", method=host), quiet())
+    params = TrainParams(run=f"pull-{host}", iterations=12, max_gaussians=300, method=host)
+    train_shot(world.shot, params, quiet())
     model = load_run(world.shot, f"pull-{host}").model
     with torch.no_grad():
         for p in model.field.parameters():
@@ -134,29 +125,28 @@ def test_state_can_be_evaluated_without_canonical_gradients(world, quiet, host):
     assert sum(reached[False][1]) >= 4
 
 
-@pytest.mark.parametrize("host", ["mlp", "control_points"])
-def test_any_host_works_behind_the_gate_and_resumes(world, quiet, host, monkeypatch):
+def test_another_host_works_behind_the_gate_and_resumes(world, quiet, monkeypatch):
     """Gaussians are split and pruned while the field exists: a host's own parameters must follow."""
 
     def easily_moved():
         config = preview()
-        config.gate.pixels = 1e-3  # 200 steps are too few for a network to detect motion
+        config.gate.pixels = 1e-3  # 110 steps are too few to detect motion
         return config
 
     preview = PRESETS["preview"]
     monkeypatch.setitem(PRESETS, "preview", easily_moved)
 
     def params(run):
-        return TrainParams(run=f"{run}-{host}", iterations=200, max_gaussians=1500, host=host)
+        return TrainParams(run=f"{run}-points", iterations=110, max_gaussians=1500, host="control_points")
 
     report = quiet()
     summary = train_shot(world.shot, params("whole"), report)
     assert 0 < summary["moving_share"] < 0.8
-    assert summary["host"] == host
+    assert summary["host"] == "control_points"
     with pytest.raises(Cancelled):
         train_shot(world.shot, params("broken"), quiet(cancel_at=("training", 0.7)))
     train_shot(world.shot, params("broken"), quiet())
-    assert_same_run(world.shot.run(f"whole-{host}"), world.shot.run(f"broken-{host}"), rtol=1e-3, atol=1e-4)
+    assert_same_run(world.shot.run("whole-points"), world.shot.run("broken-points"), rtol=1e-3, atol=1e-4)
 
 
 def test_wrong_choices_are_named():
@@ -229,9 +219,8 @@ def begun_in(run):
     return sorted(p.parent for p in run.glob("next/*/checkpoint.safetensors"))
 
 
-def test_finished_run_is_kept_until_its_replacement_is_done(world, quiet):
-    train_shot(world.shot, short("mixed"), quiet())
-    run = world.shot.run("mixed")
+def test_finished_run_is_kept_until_its_replacement_is_done(world, quiet, finished):
+    run = finished("mixed")
     before = files_of(run)
     report = quiet(cancel_at=("training", 0.5))
     with pytest.raises(Cancelled):
@@ -255,9 +244,8 @@ def test_finished_run_is_kept_until_its_replacement_is_done(world, quiet):
     assert rows == list(range(6, 61, 6))
 
 
-def test_cancelled_evaluation_runs_on_resume(world, quiet, monkeypatch):
+def test_cancelled_evaluation_runs_on_resume(world, quiet, monkeypatch, master):
     """Two cancels in an evaluation, and two in the last one: the curve has no gap."""
-    train_shot(world.shot, short("whole"), quiet())
     measured, goes_on = Trainer.frame_psnrs, []
 
     def pressed(self, *args, **options):
@@ -274,23 +262,21 @@ def test_cancelled_evaluation_runs_on_resume(world, quiet, monkeypatch):
     report = quiet()
     train_shot(world.shot, short("holed"), report)
     assert goes_on == [30, 30, 60, 60]
-    curves = []
-    for name in ("whole", "holed"):
-        lines = (world.shot.run(name) / "metrics.jsonl").read_text().splitlines()
+    run, curves = world.shot.run("holed"), []
+    for folder in (master, run):
+        lines = (folder / "metrics.jsonl").read_text().splitlines()
         curves.append([{**json.loads(line), "seconds": None} for line in lines])
     assert curves[0] == curves[1]
     assert [row["iteration"] for row in curves[0]] == list(range(6, 61, 6))
-    whole, holed = (files_of(world.shot.run(name)) for name in ("whole", "holed"))
+    whole, holed = files_of(master), files_of(run)
     pictures = [name for name in whole if name.startswith("previews")]
     assert len(pictures) == 10
     assert {name: whole[name] for name in pictures} == {n: digest for n, digest in holed.items() if n in pictures}
-    from_file, resumed = (
-        load_checkpoint(world.shot.run(name) / "checkpoint.safetensors")[0] for name in ("whole", "holed")
-    )
+    from_file, resumed = (load_checkpoint(folder / CHECKPOINT_FILE)[0] for folder in (master, run))
     assert all(torch.equal(value, resumed[name]) for name, value in from_file.items())
 
 
-def test_what_a_step_was_measured_at_is_not_measured_again_when_the_run_goes_on(world, quiet):
+def test_resumed_run_ends_as_an_unbroken_one_and_measures_no_step_twice(world, quiet, master):
     class Stops(quiet):
         def image(self, label, path):
             super().image(label, path)
@@ -307,25 +293,25 @@ def test_what_a_step_was_measured_at_is_not_measured_again_when_the_run_goes_on(
     ]
     assert rows == list(range(6, 61, 6))
     assert [Path(e[2]).stem for e in report.events if e[0] == "image"] == [f"{n:06d}" for n in range(36, 61, 6)]
+    assert_same_run(master, world.shot.run("told"))
 
 
-def test_a_finished_run_that_begins_anew_stays_too(world, quiet):
-    train_shot(world.shot, short("restarted"), quiet())
-    run = world.shot.run("restarted")
+def test_a_finished_run_that_begins_anew_stays_too(world, quiet, finished):
+    run = finished("restarted")
     before = files_of(run)
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short("restarted", resume=False), quiet(cancel_at=("training", 0.5)))
+        train_shot(world.shot, short("restarted", resume=False), quiet(cancel_at=("training", 0.1)))
     assert files_of(run) == before
     train_shot(world.shot, short("restarted"), quiet())
     assert not begun_in(run), "the finished run is what it could only come to"
 
 
-def test_a_training_that_was_begun_behind_a_link_is_not_gone_on_with(world, quiet, tmp_path):
+def test_a_training_that_was_begun_behind_a_link_is_not_gone_on_with(world, quiet, tmp_path, finished):
     """A shot folder may come from anywhere, and a link in it may lead to another user's run."""
-    train_shot(world.shot, short("linked"), quiet())
+    run = finished("linked")
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short("linked", seed=5), quiet(cancel_at=("training", 0.5)))
-    (work,) = begun_in(world.shot.run("linked"))
+        train_shot(world.shot, short("linked", seed=5), quiet(cancel_at=("training", 0.1)))
+    (work,) = begun_in(run)
     theirs = work.rename(tmp_path / "theirs")
     before = files_of(theirs)
     work.symlink_to(theirs)
@@ -338,7 +324,7 @@ def test_paused_runs_of_one_name_wait_side_by_side(world, quiet):
     """A short training with other settings must not delete hours of a paused run."""
     for seed in (1, 2, 3):
         with pytest.raises(Cancelled):
-            train_shot(world.shot, short("paused", seed=seed), quiet(cancel_at=("training", 0.5)))
+            train_shot(world.shot, short("paused", seed=seed), quiet(cancel_at=("training", 0.1)))
     run = world.shot.run("paused")
     assert load_run(world.shot, "paused").config.seed == 1
     assert len(begun_in(run)) == 2
@@ -353,8 +339,9 @@ def test_kill_during_run_replacement_is_repaired(world, quiet, tmp_path):
     """Files are replaced one after the other; the state after each replacement is built by hand."""
     shot = Shot(shutil.copytree(world.shot.root, tmp_path / "s.splannequin", ignore=shutil.ignore_patterns("runs")))
     run, old, new = shot.run("main"), tmp_path / "old", tmp_path / "new"
-    for seed, folder in ((0, old), (5, new)):
-        train_shot(shot, short("main", seed=seed), quiet())
+    params = TrainParams(iterations=12, max_gaussians=300, method="static", seed=5)
+    for folder, seed in ((old, 0), (new, 5)):
+        train_shot(shot, replace(params, seed=seed), quiet())
         run.rename(folder)
     key, expected = json.loads((new / "summary.json").read_text())["key"], files_of(new)
     for moved in range(5):
@@ -366,57 +353,47 @@ def test_kill_during_run_replacement_is_repaired(world, quiet, tmp_path):
             (run / "next" / key / name).replace(run / name)
         assert load_run(shot, "main").config.seed == (5 if moved else 0), "it can be frozen from meanwhile"
         report = quiet()
-        train_shot(shot, short("main", seed=5), report)
+        train_shot(shot, params, report)
         assert ("progress", "training", 1, 1, "already trained") in report.events
         assert files_of(run) == expected
         assert not (run / "next").exists()
         shutil.rmtree(run)
 
 
-def test_cancelling_at_once_keeps_the_finished_checkpoint(world, quiet):
-    train_shot(world.shot, short("kept"), quiet())
+def test_cancelling_at_once_keeps_the_finished_checkpoint(world, quiet, finished):
+    finished("kept")
     with pytest.raises(Cancelled):
         train_shot(world.shot, short("kept", seed=5), quiet(cancel_at=("loading frames", 0.5)))
     assert load_run(world.shot, "kept").config.seed == 0
 
 
-def test_run_of_a_different_solve_is_refused(tmp_path, quiet):
-    world = build_world(tmp_path)
-    train_shot(world.shot, short("main"), quiet())
-    path = world.shot.solve / "cameras.json"
-    path.write_text(path.read_text().replace("registered", "localised", 1))
-    with pytest.raises(JobError, match="other cameras"):
-        load_run(world.shot, "main")
-
-
-def test_run_of_different_pictures_is_refused_and_retrained(tmp_path, quiet):
+def test_run_of_different_pictures_is_refused_and_retrained(world, tmp_path, quiet):
     """Another grade of the same footage with imported cameras, whose files are identical byte by byte."""
-    world = build_world(tmp_path)
-    record = json.loads(world.shot.listing.read_text())
+    shot = Shot(shutil.copytree(world.shot.root, tmp_path / "s.splannequin", ignore=shutil.ignore_patterns("runs")))
+    record, params = json.loads(shot.listing.read_text()), TrainParams(iterations=12, max_gaussians=300)
 
     def imported(key):
-        write_json(world.shot.listing, {**record, "key": key})
+        write_json(shot.listing, {**record, "key": key})
 
     def trained():
         report = quiet()
-        train_shot(world.shot, short("main"), report)
+        train_shot(shot, params, report)
         return ("progress", "training", 1, 1, "already trained") not in report.events
 
     imported("as filmed")
     assert trained() and not trained()
-    before = load_run(world.shot, "main")
+    before = load_run(shot, "main")
     imported("graded")
     with pytest.raises(JobError, match="other pictures"):
-        load_run(world.shot, "main")
+        load_run(shot, "main")
     with pytest.raises(JobError, match="other pictures"):
-        train_shot(world.shot, short("main", extend=5), quiet())
-    assert trained() and not trained() and load_run(world.shot, "main").stamp != before.stamp
+        train_shot(shot, replace(params, extend=5), quiet())
+    assert trained() and not trained() and load_run(shot, "main").stamp != before.stamp
 
 
-def test_a_run_is_known_by_its_content_whatever_the_time_of_its_file(world, quiet, tmp_path):
+def test_a_run_is_known_by_its_content_whatever_the_time_of_its_file(world, tmp_path, finished):
     """A disk may round modification times, and `cp -r` changes them."""
-    train_shot(world.shot, short("timed"), quiet())
-    checkpoint = world.shot.run("timed") / CHECKPOINT_FILE
+    checkpoint = finished("timed") / CHECKPOINT_FILE
     run = load_run(world.shot, "timed")
     for time in (checkpoint.stat().st_mtime_ns // 100 * 100, 1):
         os.utime(checkpoint, ns=(time, time))
@@ -435,30 +412,15 @@ def test_figures_are_not_appended_through_a_link(world, quiet, tmp_path):
     theirs.touch()
     folder.mkdir(parents=True)
     (folder / "metrics.jsonl").symlink_to(theirs)
-    train_shot(world.shot, short("figures"), quiet())
+    train_shot(world.shot, TrainParams(run="figures", iterations=12, max_gaussians=300), quiet())
     assert not theirs.read_text() and not (folder / "metrics.jsonl").is_symlink()
 
 
-def test_damaged_checkpoint_is_an_error_in_words(world, quiet):
-    train_shot(world.shot, short("damaged"), quiet())
-    path = world.shot.run("damaged") / "checkpoint.safetensors"
+def test_damaged_checkpoint_is_an_error_in_words(world, finished):
+    path = finished("damaged") / CHECKPOINT_FILE
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(JobError, match="cannot be read"):
         load_run(world.shot, "damaged")
-
-
-def test_a_bad_frame_is_skipped_not_learnt(world, quiet):
-    scene = load_scene(world.shot)
-    config = config_from_params(TrainParams(iterations=40))
-    images = load_images(scene, scene.solved, 64, 48)
-    report = quiet()
-    trainer = Trainer(scene, images, scene.solved, config, report)
-    trainer.images[5] = math.nan
-    for _ in range(16):
-        trainer.step()
-        trainer.iteration += 1
-    assert any(e[0] == "warning" and "not finite" in e[1] for e in report.events)
-    assert all(bool(torch.isfinite(p).all()) for p in trainer.model.gaussians.params.values())
 
 
 def test_a_run_that_keeps_failing_ends_in_words(world, quiet):
@@ -476,25 +438,21 @@ def test_inside_frustum():
     assert inside_frustum(means, torch.eye(4), K, 32, 16).tolist() == [True, False, True, False, False]
 
 
-@pytest.mark.parametrize("wrong", ["exposure", "field"])
-def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wrong):
+def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet):
     """The file is complete and of the right version, but a tensor is missing or has another shape."""
-    shutil.copytree(world.shot.root, tmp_path / "misfit.splannequin")
-    shot = Shot.open(tmp_path / "misfit.splannequin")
-    params = TrainParams(run="misfit", iterations=30, max_gaussians=300, method="hexplane")
-    train_shot(shot, params, quiet())
-    path = shot.run("misfit") / CHECKPOINT_FILE
+    params = TrainParams(run="misfit", iterations=12, max_gaussians=300, method="hexplane")
+    train_shot(world.shot, params, quiet())
+    path = world.shot.run("misfit") / CHECKPOINT_FILE
+    (path.parent / "summary.json").unlink()
     tensors, meta = load_checkpoint(path)
-    if wrong == "exposure":
-        tensors["exposure"] = tensors["exposure"][:-1].clone()
-    else:
-        del tensors[next(name for name in tensors if name.startswith("field."))]
-    save_checkpoint(path, tensors, meta)
-    with pytest.raises(JobError, match="does not fit this version"):
-        load_run(shot, "misfit")
-    (shot.run("misfit") / "summary.json").unlink()
-    with pytest.raises(JobError, match="does not fit this version"):
-        train_shot(shot, params, quiet())
+    field = next(name for name in tensors if name.startswith("field."))
+    shorter = {**tensors, "exposure": tensors["exposure"][:-1].clone()}
+    for wrong in (shorter, {name: value for name, value in tensors.items() if name != field}):
+        save_checkpoint(path, wrong, meta)
+        with pytest.raises(JobError, match="does not fit this version"):
+            load_run(world.shot, "misfit")
+        with pytest.raises(JobError, match="does not fit this version"):
+            train_shot(world.shot, params, quiet())
 
 
 def test_a_card_that_fails_says_nothing_of_the_checkpoint():
