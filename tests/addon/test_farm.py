@@ -68,8 +68,8 @@ def test_the_verb_passes_its_words_on(run, imported, tmp_path, stand_in):
     words = ["--t-star", "5,7", "--frames", "2", "--freeze-width", "48", "--device", "cpu"]
     code, said, err = run("farm", "export", imported, "--output", out, *words)
     assert code == 0, err
-    assert f"farm export {imported} " in said and f"--output {out}" in said and "--device cpu" in said
-    assert "--t-star 5,7" in said and "--frames 2" in said
+    assert f"farm export {imported} " in said and f"--output={out}" in said and "--device cpu" in said
+    assert "--t-star=5,7" in said and "--frames=2" in said
     assert json.loads((out / "request.json").read_text())["freeze"]["width"] == 48
 
 
