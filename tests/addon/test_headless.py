@@ -268,6 +268,7 @@ def test_command_line_options_reach_the_backend(addon, contract, monkeypatch, tm
                   "--detector", "weight")["train"]  # fmt: skip
     assert (train.method, train.host, train.host_config, train.detector) == ("mlp", "mlp", "reference", "weight")
     assert train.device == "cpu" and requested("train", tmp_path, "--device", "cuda")["train"].device == "cuda"
+    assert requested("train", tmp_path, "--extend", 10)["train"].extend == 10
     frozen = requested("freeze", "a.mp4", "--no-grain", "--camera-path", tmp_path / "p.json")["freeze"]
     assert (frozen.grain, frozen.camera_path, frozen.device) == (False, str(tmp_path / "p.json"), "cpu")
     assert frozen.only_missing, "frames that are finished are not rendered again"
