@@ -128,6 +128,22 @@ def frozen_world(_frozen_world: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture
+def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], str]:
+    """stand_in(line): a shell script with this line takes the place of the backend's Python; returns its path."""
+    if sys.platform == "win32":
+        pytest.skip("the stand-in is a shell script")
+
+    def put(line: str) -> str:
+        program = tmp_path / "stand-in"
+        program.write_text(f"#!/bin/sh\n{line}\n")
+        program.chmod(0o755)
+        monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(program))
+        return str(program)
+
+    return put
+
+
+@pytest.fixture
 def new_take() -> Callable[[Path, str], Path]:
     return add_take
 

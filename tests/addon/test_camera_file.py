@@ -125,16 +125,14 @@ def test_a_file_without_a_camera_that_moves_is_refused(contract, filmed, reading
         reading()
 
 
-@pytest.mark.parametrize("ending", [".abc", ".fbx"])
-def test_what_is_no_such_file_is_refused_in_a_sentence(addon, contract, filmed, shot, tmp_path, ending):
-    file = tmp_path / f"broken{ending}"
+def test_what_is_no_such_file_is_refused_in_a_sentence(addon, contract, filmed, shot, tmp_path):
+    file = tmp_path / "broken.fbx"
     file.write_bytes(b"Kaydara FBX Binary  \x00" + bytes(range(256)))
     filmed.splannequin.cameras_path = str(file)
-    said = rf"^Blender could not read broken{ending}: .+\.$|^This Blender .+ has no importer for Alembic\."
-    with pytest.raises(contract.JobError, match=said) as refusal:
+    with pytest.raises(contract.JobError, match=r"^Blender could not read broken\.fbx: .+\.$") as refusal:
         addon("process.steps").STEPS["solve"].params(filmed)
     assert refusal.value.exit_code == contract.ExitCode.SOLVE and not (shot / "tracking").exists()
-    filmed.splannequin.cameras_path = str(tmp_path / f"gone{ending}")
+    filmed.splannequin.cameras_path = str(tmp_path / "gone.fbx")
     with pytest.raises(contract.JobError, match="does not exist"):
         addon("process.steps").STEPS["solve"].params(filmed)
 

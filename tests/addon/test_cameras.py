@@ -401,6 +401,7 @@ def test_a_take_begins_though_its_scene_is_renamed_while_the_camera_is_read(addo
     while watch.work is not None:
         timer.tick()
     assert not watch.failures and watch.jobs["freeze"].scene_uid == moving.session_uid
+    watch.jobs["freeze"].process.kill()
     watch.jobs["freeze"].process.wait()
 
 

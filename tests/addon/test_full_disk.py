@@ -45,8 +45,7 @@ def artists_file(scene, tmp_path):
     return make
 
 
-@pytest.mark.parametrize("part", ["all", "frames"])
-@pytest.mark.parametrize("kind", ["PNG", "OPEN_EXR", "DPX"])
+@pytest.mark.parametrize(("kind", "part"), [("PNG", "all"), ("OPEN_EXR", "frames"), ("DPX", "frames")])
 def test_a_full_disk_is_said_and_earlier_frames_stay(addon, shot, small_disk, artists_file, capfd, kind, part):
     bake = ["bake", "--shot", shot, "--output", small_disk, "--blend", artists_file(kind), "--part", part]
     bake = [str(word) for word in bake]

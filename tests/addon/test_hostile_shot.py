@@ -27,7 +27,8 @@ def test_scrubbing(addon, trap, shot, root):
     until = time.monotonic() + 120
     while session.open and time.monotonic() < until:
         time.sleep(0.05)
-    assert "nothing" in session.failure[0], "it is our backend that answered"
+    assert "'nothing'" in session.failure[0], "it is our backend that answered"
+    assert session.failure[1] == "Run the training step first." and session._process.wait(20) != 0
     assert not trap.exists(), trap.read_text()
 
 

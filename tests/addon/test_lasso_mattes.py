@@ -74,7 +74,7 @@ def chosen(scene, world):
     return props
 
 
-def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, chosen, world, tmp_path):
+def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, chosen, world, tmp_path, stand_in):
     shot, masks, outline = world
     chosen.matte_mask = mask_of("red patch", outline)
     assert bpy.ops.splannequin.matte_from_mask() == {"FINISHED"}
@@ -89,9 +89,9 @@ def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, 
     assert state.state.takes["freeze"]["mattes"] == {"red patch": [107]}
 
     scene.frame_set(109)  # a lasso on another frame is added to the existing matte
-    assert bpy.ops.splannequin.matte_from_mask() == {"FINISHED"}
-    lassos = addon("shot.inventory").mattes(addon("freeze.mattes").take_of(shot, "freeze"))
-    assert lassos == {"red patch": [107, 109]}
+    addon("freeze.mattes").params_of(scene, shot)
+    drawn = json.loads(addon("freeze.mattes").take_of(shot, "freeze").drawn_lassos.read_text())["mattes"]
+    assert [(row["name"], row["frame"]) for row in drawn] == [("red patch", 107), ("red patch", 109)]
 
     compat = addon("compat")
     tree = compat.new_compositor_tree(scene, "Comp")
@@ -112,8 +112,10 @@ def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, 
     assert np.abs(picked - read(single / "000106.exr")[..., 0]).max() < 0.01
     assert (picked > 0.5).any()
 
-    assert bpy.ops.splannequin.remove_matte(name="red patch") == {"FINISHED"}
-    assert not single.exists()
+    stand_in("exit 3")
+    with pytest.raises(RuntimeError, match="stopped unexpectedly"):
+        bpy.ops.splannequin.remove_matte(name="red patch")
+    assert addon("process.job_timer").watch_of(shot).jobs["freeze"].params["remove"] == "red patch"
 
 
 def test_uncreatable_paths_give_a_readable_error(addon, chosen, world):

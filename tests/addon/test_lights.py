@@ -75,6 +75,7 @@ def shown(scene, folder: Path, side: int) -> dict[tuple[int, int, int], np.ndarr
     scene.camera, render = camera, scene.render
     render.engine, render.film_transparent, scene.cycles.samples, scene.cycles.device = "CYCLES", False, 1, "CPU"
     scene.cycles.use_denoising = False  # Debian's Blender is built without it
+    scene.world.cycles.sampling_method = "NONE"  # makes no map for samples towards the light
     render.resolution_x = render.resolution_y = size
     render.resolution_percentage, render.use_compositing = 100, False
     render.image_settings.file_format = "OPEN_EXR"

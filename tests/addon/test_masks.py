@@ -144,6 +144,7 @@ def test_masks_are_rendered_by_the_timer_and_then_the_solve_begins(addon, render
     assert not rendering.failures and rendering.work is None
     assert rendering.jobs["solve"].params["people_mask"] == str(shot / "masks" / "people")
     assert sorted(p.name for p in (shot / "masks" / "people").iterdir()) == ["000005.png", "000006.png", "000007.png"]
+    rendering.jobs["solve"].process.kill()
     rendering.jobs["solve"].process.wait()
 
 
@@ -153,6 +154,7 @@ def test_a_solve_begins_though_its_scene_and_its_mask_are_renamed_meanwhile(addo
         addon("process.job_timer").tick()
     assert not rendering.failures and rendering.jobs["solve"].scene_uid == scene.session_uid
     assert len(list((shot / "masks" / "people").iterdir())) == 3
+    rendering.jobs["solve"].process.kill()
     rendering.jobs["solve"].process.wait()
 
 

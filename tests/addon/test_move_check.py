@@ -1,6 +1,6 @@
 """Check of a camera move before the freeze: a real backend reports the areas that its pictures will lack."""
 
-import shutil
+import re
 
 import bpy
 import numpy as np
@@ -25,42 +25,51 @@ def move(addon, scene, world):
     return scene.splannequin.path_camera
 
 
-def found(addon, scene, world, name):
-    check = addon("freeze.move_check")
-    return check.waited(check.checking(scene, world, name)).shares
+@pytest.fixture(scope="module")
+def _session(addon, world):
+    backend = addon("process.backend")
+    one = addon("freeze.live").open_session(world, "main", backend.python(), backend.package_root())
+    yield one
+    one.close()
 
 
-def test_guessed_share_is_small_near_the_path_and_full_when_turned_away(addon, scene, world, move):
-    scene.frame_set(103)
-    shares = found(addon, scene, world, move.name)
-    assert list(shares) == list(range(101, 117)) and scene.frame_current == 103
-    assert np.mean(list(shares.values())) < 0.3
-    turned_camera = bpy.data.objects.new("away", move.data)
-    scene.collection.objects.link(turned_camera)
-    scene.frame_set(105)
-    turned_camera.matrix_world = move.matrix_world @ Matrix.Rotation(np.pi, 4, "Y")
-    bpy.context.view_layer.update()
-    assert min(found(addon, scene, world, "away").values()) > 0.95
+@pytest.fixture
+def scrubbed(addon, _session, monkeypatch):
+    """A real session of the run, which the view shows and the check shares."""
+    monkeypatch.setattr(addon("freeze.viewport"), "_session", _session)
 
 
-def test_the_operator_says_it_and_leaves_the_scene_as_it_is(addon, scene, world, move):
+def test_the_operator_says_a_small_share_near_the_path_and_leaves_the_scene_as_it_is(
+    addon, scene, world, move, scrubbed
+):
     scene.frame_set(110)
     assert bpy.ops.splannequin.check_move() == {"FINISHED"}
     watch = addon("process.job_timer").watch_of(world)
-    assert len(watch.notes["freeze"]) == 1 and move.name in watch.notes["freeze"][0]
+    (said,) = watch.notes["freeze"]
+    assert move.name in said and int(re.search(r"about (\d+) %", said)[1]) < 30
     assert scene.frame_current == 110 and not watch.running()
     scene.splannequin.path_camera = None
     assert not bpy.ops.splannequin.check_move.poll()
 
 
-def test_long_move_is_checked_at_sampled_frames(addon, scene, world, move):
+def test_share_is_full_when_turned_away_and_a_long_move_is_checked_at_sampled_frames(
+    addon, scene, world, move, scrubbed, monkeypatch
+):
+    turned_camera = bpy.data.objects.new("away", move.data)
+    scene.collection.objects.link(turned_camera)
+    scene.frame_set(105)
+    turned_camera.matrix_world = move.matrix_world @ Matrix.Rotation(np.pi, 4, "Y")
+    bpy.context.view_layer.update()
     scene.frame_start, scene.frame_end = 101, 301
-    shares = found(addon, scene, world, move.name)
-    assert len(shares) <= addon("freeze.move_check").MOST_FRAMES + 1
-    assert min(shares) == 101 and max(shares) == 301
+    check = addon("freeze.move_check")
+    monkeypatch.setattr(check, "MOST_FRAMES", 6)
+    shares = check.waited(check.checking(scene, world, "away")).shares
+    assert min(shares.values()) > 0.95
+    assert len(shares) <= check.MOST_FRAMES + 1 and min(shares) == 101 and max(shares) == 301
 
 
-def test_in_a_window_it_takes_turns_and_can_be_stopped(addon, scene, world, move):
+def test_in_a_window_it_takes_turns_and_can_be_stopped(addon, scene, world, move, stand_in):
+    stand_in("exec cat > /dev/null")
     timer, check = addon("process.job_timer"), addon("freeze.move_check")
     timer.work(world, "freeze", check._in_turns(scene.session_uid, world, move.name))
     watch = timer.watch_of(world)
@@ -70,9 +79,8 @@ def test_in_a_window_it_takes_turns_and_can_be_stopped(addon, scene, world, move
     assert timer.stop_work(watch) and watch.running() is None and "freeze" not in watch.failures
 
 
-def test_a_run_that_cannot_be_loaded_is_named(addon, contract, scene, world, move, tmp_path):
-    broken = tmp_path / "broken.splannequin"
-    shutil.copytree(world, broken)
-    (broken / "runs" / scene.splannequin.run_name / "checkpoint.safetensors").write_bytes(b"nothing")
+def test_a_session_that_ends_ends_the_check(addon, contract, scene, world, move, stand_in):
+    stand_in("exit 3")
+    check = addon("freeze.move_check")
     with pytest.raises(contract.JobError):
-        found(addon, scene, broken, move.name)
+        check.waited(check.checking(scene, world, move.name))

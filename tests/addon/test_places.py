@@ -257,9 +257,8 @@ def test_a_failed_import_leaves_no_empty_shot(addon, scene, tmp_path):
     with pytest.raises(RuntimeError, match=r"text\.mp4"):
         bpy.ops.splannequin.import_clip()
     assert [p.name for p in tmp_path.iterdir()] == ["text.mp4"]
-    assert addon("command_line.headless").main(["import", str(tmp_path / "s.splannequin"), str(wrong)]) == 3
     assert addon("command_line.headless").main(["freeze", str(wrong), "--output", str(tmp_path / "out")]) == 3
-    assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_failed_import_is_removed_after_its_process_ended(addon, contract, tmp_path):

@@ -108,6 +108,7 @@ def test_the_timer_reads_it_in_turns_and_the_solve_begins(addon, chosen, shot):
     assert watch.jobs["solve"].folder.is_dir() and (shot / "tracking" / "transforms.json").is_file()
     request = json.loads((watch.jobs["solve"].folder / "request.json").read_text(encoding="utf-8"))
     assert request["params"]["cameras"] == str(shot / "tracking" / "transforms.json")
+    watch.jobs["solve"].process.kill()
     watch.jobs["solve"].process.wait()
 
 

@@ -157,14 +157,13 @@ def test_an_st_map_is_handed_on_with_its_way_and_only_where_the_lens_is_ours_to_
     assert solve.params(scene).st_map == "", "imported cameras already have a lens"
 
 
-@pytest.mark.parametrize("kind", ["colmap", "colmap_text", "nerfstudio"])
+@pytest.mark.parametrize("kind", ["colmap_text", "nerfstudio"])
 def test_the_export_button_writes_every_camera(scene, shot, tmp_path, contract, kind):
     scene.splannequin.shot_path = str(shot)
     out = tmp_path / "out é"
     assert bpy.ops.splannequin.export_cameras(directory=str(out), format=kind) == {"FINISHED"}
     path = contract.CameraPath.load(shot / "solve" / "cameras.json")
     names = {
-        "colmap": {"cameras.bin", "images.bin", "points3D.bin"},
         "colmap_text": {"cameras.txt", "images.txt", "points3D.txt"},
         "nerfstudio": {"transforms.json", "points.ply"},
     }[kind]
@@ -187,6 +186,7 @@ def test_the_export_button_says_what_is_wrong(scene, shot, tmp_path):
         bpy.ops.splannequin.export_cameras(directory=str(tmp_path / "out"))
     scene.splannequin.shot_path = str(shot)
     bpy.ops.splannequin.export_cameras(directory=str(tmp_path / "out"))
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"cameras.bin", "images.bin", "points3D.bin"}
     with pytest.raises(RuntimeError, match=r"already contains another COLMAP model \(cameras\.bin\)"):
         bpy.ops.splannequin.export_cameras(directory=str(tmp_path / "out"), format="colmap_text")
 

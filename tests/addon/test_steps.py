@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import shutil
 import types
 from pathlib import Path
@@ -11,27 +12,30 @@ import numpy as np
 import pytest
 
 
-def test_the_import_button_brings_the_clip_in(addon, scene, clip, tmp_path):
-    props = scene.splannequin
-    props.clip, props.shot_path = str(clip), str(tmp_path / "s.splannequin")
-    props.use_range, props.first, props.last = True, 2, 9
-    assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
-    state = addon("shot.inventory").read(tmp_path / "s.splannequin")
-    assert state.frames == 8 and state.frame_range == (2, 9)
-    assert (scene.frame_start, scene.frame_end) == (2, 9), "a new scene takes the clip's range"
-    assert (scene.render.resolution_x, scene.render.resolution_y) == state.size
-    assert scene.render.fps / scene.render.fps_base == pytest.approx(state.info["fps"])
-    assert 2 <= props.t_star <= 9
-
-
-def test_an_import_with_a_start_counts_from_it(addon, scene, clip, tmp_path):
+def test_the_import_button_brings_the_clip_in_and_replaces_work_only_with_consent(addon, scene, clip, tmp_path):
     props = scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "s.splannequin")
     props.use_range, props.first, props.last = True, 2, 9
     props.use_start, props.start = True, 1001
     assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
-    assert addon("shot.inventory").read(tmp_path / "s.splannequin").frame_range == (1001, 1008)
-    assert (scene.frame_start, scene.frame_end) == (1001, 1008) and 1001 <= props.t_star <= 1008
+    state = addon("shot.inventory").read(tmp_path / "s.splannequin")
+    assert state.frames == 8 and state.frame_range == (1001, 1008)
+    assert (scene.frame_start, scene.frame_end) == (1001, 1008), "a new scene takes the clip's range"
+    assert (scene.render.resolution_x, scene.render.resolution_y) == state.size
+    assert scene.render.fps / scene.render.fps_base == pytest.approx(state.info["fps"])
+    assert 1001 <= props.t_star <= 1008
+
+    folder = tmp_path / "s.splannequin"  # other frames replace work only with consent
+    (folder / "solve").mkdir()
+    (folder / "solve" / "cameras.json").write_text("{}")
+    question = addon("footage.operators").replaces(scene)
+    assert "a solved camera" in question and "gelöste Kamera" in addon("translations").translate(question, "de_DE")
+    props.first, props.last = 3, 12
+    with pytest.raises(RuntimeError, match="--replace"):
+        bpy.ops.splannequin.import_clip()
+    assert (folder / "solve" / "cameras.json").is_file()
+    assert bpy.ops.splannequin.import_clip(replace=True) == {"FINISHED"}
+    assert (folder / "replaced" / "001" / "solve" / "cameras.json").is_file() and not (folder / "solve").exists()
 
 
 def test_scene_in_use_changes_only_with_consent(addon, scene, shot):
@@ -249,16 +253,6 @@ def test_damaged_points_give_a_readable_error(addon, scene, shot):
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
 
 
-def test_second_clip_gets_a_separate_shot_folder(addon, scene, clip, tmp_path):
-    props = scene.splannequin
-    props.use_range, props.first, props.last = True, 1, 8
-    for name in ("first.mp4", "second.mp4"):
-        props.clip = str(shutil.copy(clip, tmp_path / name))
-        addon("process.begin").run(scene, "import")
-    assert {p.name for p in tmp_path.glob("*.splannequin")} == {"first.splannequin", "second.splannequin"}
-    assert addon("shot.selection").shot_folder(scene) == tmp_path / "second.splannequin"
-
-
 def imported(addon, scene, clip, name: Path) -> Path:
     """Import a copy of the clip, called `name`, in the scene; return its shot folder."""
     name.parent.mkdir(exist_ok=True)
@@ -275,14 +269,28 @@ def a_few(scene):
     return scene
 
 
-def test_two_clips_that_differ_in_their_ending_have_a_shot_each(addon, a_few, clip, tmp_path):
+def recorded(addon, contract, scene, name: Path) -> Path:
+    """Write the records of an import of a clip, called `name`, in the scene; return its shot folder."""
+    name.parent.mkdir(exist_ok=True)
+    name.touch()
+    scene.splannequin.clip = str(name)
+    folder = addon("shot.selection").shot_folder(scene)
+    if not folder.exists():
+        addon("shot.inventory").create(folder)
+        info, record = folder / "shot.json", {"version": 1, "frames": [], "beside": os.path.relpath(name, folder)}
+        contract.write_json(info, {**contract.read_json(info), "source": str(name)})
+        contract.write_json(folder / "frames" / "frames.json", record)
+    return folder
+
+
+def test_two_clips_that_differ_in_their_ending_have_a_shot_each(addon, contract, a_few, clip, tmp_path):
     first = imported(addon, a_few, clip, tmp_path / "a.mov")
-    second = imported(addon, a_few, clip, tmp_path / "a.mp4")
+    second = recorded(addon, contract, a_few, tmp_path / "a.mp4")
     assert (first, second) == (tmp_path / "a.splannequin", tmp_path / "a.mp4.splannequin")
     sources = [addon("shot.source").named(folder) for folder in (first, second)]
     assert sources == [str(tmp_path / "a.mov"), str(tmp_path / "a.mp4")]
     for name, folder in (("a.mov", first), ("a.mp4", second)):
-        assert imported(addon, a_few, clip, tmp_path / name) == folder, "the same clip again"
+        assert recorded(addon, contract, a_few, tmp_path / name) == folder, "the same clip again"
     assert not addon("shot.selection").missing(a_few, addon("shot.inventory").read(second))
     shutil.rmtree(first)
     addon("shot.selection").clear_cache()
@@ -292,8 +300,8 @@ def test_two_clips_that_differ_in_their_ending_have_a_shot_each(addon, a_few, cl
     assert addon("shot.selection").shot_folder(a_few) == first
 
 
-def test_a_clip_and_its_shot_stay_together_wherever_they_are_taken(addon, a_few, clip, tmp_path):
-    imported(addon, a_few, clip, tmp_path / "here" / "a.mov")
+def test_a_clip_and_its_shot_stay_together_wherever_they_are_taken(addon, contract, a_few, tmp_path):
+    recorded(addon, contract, a_few, tmp_path / "here" / "a.mov")
     shutil.copytree(tmp_path / "here", tmp_path / "copy")
     a_few.splannequin.clip = str(tmp_path / "copy" / "a.mov")
     assert addon("shot.selection").shot_folder(a_few) == tmp_path / "copy" / "a.splannequin"
@@ -303,13 +311,13 @@ def test_a_clip_and_its_shot_stay_together_wherever_they_are_taken(addon, a_few,
 
 
 def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_without_a_question(
-    addon, a_few, clip, tmp_path
+    addon, contract, a_few, tmp_path
 ):
     replaces, props = addon("footage.operators").replaces, a_few.splannequin
     props.shot_path = str(tmp_path / "own.splannequin")
     props.clip = str(tmp_path / "A" / "shot.mp4")
     assert not replaces(a_few), "nothing is there yet"
-    imported(addon, a_few, clip, tmp_path / "A" / "shot.mp4")
+    recorded(addon, contract, a_few, tmp_path / "A" / "shot.mp4")
     assert not replaces(a_few), "the same clip again"
     props.clip = str(tmp_path / "B" / "shot.mp4")
     question = replaces(a_few)
@@ -317,21 +325,6 @@ def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_wi
     assert addon("translations").translate(question, "de_DE").startswith("own.splannequin ist der Shot von ")
     props.clip = ""
     assert not replaces(a_few), "its own clip is taken"
-
-
-def test_shot_work_is_replaced_only_with_consent(addon, a_few, clip, tmp_path):
-    """The clip is another one of the same name, which the panel cannot detect. The panel asks; the backend refuses."""
-    folder = imported(addon, a_few, clip, tmp_path / "a.mp4")
-    (folder / "solve").mkdir()
-    (folder / "solve" / "cameras.json").write_text("{}")
-    question = addon("footage.operators").replaces(a_few)
-    assert "a solved camera" in question and "gelöste Kamera" in addon("translations").translate(question, "de_DE")
-    a_few.splannequin.use_range, a_few.splannequin.first, a_few.splannequin.last = True, 3, 12
-    with pytest.raises(RuntimeError, match="--replace"):
-        bpy.ops.splannequin.import_clip()
-    assert (folder / "solve" / "cameras.json").is_file()
-    assert bpy.ops.splannequin.import_clip(replace=True) == {"FINISHED"}
-    assert (folder / "replaced" / "001" / "solve" / "cameras.json").is_file() and not (folder / "solve").exists()
 
 
 def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, shot, tmp_path):
@@ -354,14 +347,14 @@ def test_bake_requests_ramp_or_path_as_stored(addon, shot):
 
 
 def test_a_step_is_refused_while_another_of_the_shot_runs(addon, contract, scene, clip, tmp_path):
-    jobs, props = addon("process.jobs"), scene.splannequin
+    props = scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
     job = addon("process.begin").begin(scene, "import")
     try:
         with pytest.raises(contract.JobError, match="is still running|has been running on"):
             addon("process.begin").begin(scene, "import")
     finally:
-        jobs.cancel(job)
+        job.process.kill()
         job.process.wait()
     assert len(list((tmp_path / "t.splannequin" / "jobs").iterdir())) == 1
 

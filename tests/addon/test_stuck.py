@@ -19,12 +19,11 @@ def with_raw(shot) -> Path:
 
 
 @pytest.fixture
-def session(addon, shot, monkeypatch):
-    """Session of a real backend, held by the view."""
+def session(addon, shot, monkeypatch, stand_in):
+    """Session whose backend only listens, held by the view."""
     viewport = addon("freeze.viewport")
-    one = addon("freeze.live").open_session(
-        shot, "nothing", addon("process.backend").python(), addon("process.backend").package_root()
-    )
+    python = stand_in("exec cat > /dev/null")
+    one = addon("freeze.live").open_session(shot, "nothing", python, addon("process.backend").package_root())
     monkeypatch.setattr(viewport, "_session", one)
     yield one
     viewport.end()

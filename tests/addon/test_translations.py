@@ -1,6 +1,7 @@
 """Every text that the add-on shows is translated in every shipped language, and no other text is."""
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,11 @@ SHOWN_POSITIONS = {
 TRANSLATED_BY_BLENDER = {"label", "operator", "prop", "row", "column", "split", "progress", "report"}
 """Calls that translate a literal by themselves, but no composed text."""
 A_SENTENCE = re.compile(r"[A-Z{][^\n]* [^\n]*([.]|: \{\})")
+
+
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def strings(node: ast.AST) -> Iterator[str]:
@@ -58,7 +64,7 @@ def bare(tree: ast.AST) -> set[int]:
 
 def shown_by(path: Path) -> Iterator[tuple[str, int]]:
     """(text, line) of each text that a module shows: arguments of drawing calls, and all sentences in its source."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     skip = bare(tree)
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
@@ -126,7 +132,7 @@ def written(root: Path) -> set[str]:
     """All texts in the sources, and the backend's stages as the panel shows them."""
     found: set[str] = set()
     for path in [*(root / "torch_backend").rglob("*.py"), *sources(root)]:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             found.update(map(str.strip, strings(node)))
     return found | {text[:1].upper() + text[1:] for text in found}
 
@@ -162,7 +168,7 @@ def test_what_is_composed_is_not_left_to_blender_to_look_up(root):
     for path in sources(root):
         if path.name in NOT_ON_SCREEN:
             continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             if not isinstance(node, ast.Call) or called(node) not in TRANSLATED_BY_BLENDER | {"poll_message_set"}:
                 continue
             drawn = [k.value for k in node.keywords if k.arg in SHOWN_ARGUMENTS]

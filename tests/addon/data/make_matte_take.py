@@ -21,7 +21,7 @@ def main() -> None:
     world = build_world(folder)
     write_json(world.shot.solve_record, {"version": 1, "quality": "A good solve.", "frames": 16})
     paint_motion(world)
-    train_shot(world.shot, TrainParams(iterations=400, holdout=0, max_gaussians=1500), Quiet())
+    train_shot(world.shot, TrainParams(iterations=250, holdout=0, max_gaussians=1500), Quiet())
     freeze_shot(world.shot, FreezeParams(t_star=105, first=104, last=110, detail="off", develop="off"), Quiet())
     masks = {frame: (world.patch(frame - 101, 4 / 15) > 0.5).astype(np.uint8) for frame in range(104, 111)}
     facts = {"masks": {str(n): m.tolist() for n, m in masks.items()}, "outline": outline(masks[107])[::2]}
