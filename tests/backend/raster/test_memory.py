@@ -1,4 +1,4 @@
-"""Peak memory of the CPU's implementation on inputs that could exhaust it."""
+"""Peak memory of the implementations that users run on inputs that could exhaust it."""
 
 import os
 import subprocess
@@ -7,39 +7,43 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.raster_errors import BODIES
 from tests.backend.raster.test_hard_cases import on_every_body
 
 ROOT = Path(__file__).resolve().parents[3]
 
 CHILD = """
-import resource
+import resource, sys
 import torch
 from benchmarks.raster_cases import size
-from benchmarks.raster_errors import cloud, single, stack
+from benchmarks.raster_errors import BODIES, cloud, single, stack
+body = sys.argv[1]
+_, dtype, device = BODIES[body]
 resource.setrlimit(resource.RLIMIT_AS, (24 << 30,) * 2)  # whatever asks for more is refused, not the machine swamped
-cloud(20, 20, 20).gradients("cpu")  # compiled and loaded
+cloud(20, 20, 20).gradients(body)  # compiled and loaded
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 start = peak()
 
-size("10,000 Gaussians in one pixel", "cpu").gradients("cpu")
+size("10,000 Gaussians in one pixel", body).gradients(body)
 print(peak() - start)
 scene = stack(single(1696, 1696, focal=1000.0, scale=20.0, logit=-4.0), 200_000)
 try:
-    scene.run("cpu")
+    scene.run(body)
 except RuntimeError as error:
     print(error)
 del scene
 print(peak() - start)
 scene = single(4128, 4128, focal=4128.0, scale=8.0, logit=1.0)
-leaves = scene.leaves()
-out = scene.run("cpu", leaves, with_contributions=True)
+leaves = scene.leaves(dtype, device)
+out = scene.run(body, leaves, with_contributions=True)
 out.colors.sum().backward()
 alpha = out.alphas.detach().double().sum().item()
 print(peak() - start, out.weight_sum.item() / alpha, leaves["colors"].grad[0, 0].item() / alpha)
 """
 
 
-def test_memory_grows_by_the_gaussian_and_by_the_pixel():
+@pytest.mark.parametrize("body", [body for body in BODIES if body in ("cpu", "gpu")])
+def test_memory_grows_by_the_gaussian_and_by_the_pixel(body):
     """Three scenes in one process, the hungriest last, because the peak is measured per process."""
     pytest.importorskip("resource", reason="no peak of memory on this system")
     if sys.platform != "linux":
@@ -47,7 +51,7 @@ def test_memory_grows_by_the_gaussian_and_by_the_pixel():
     # Otherwise glibc learns to keep freed blocks, and peaks vary by a factor of two.
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MALLOC_MMAP_THRESHOLD_": "65536"}
     run = subprocess.run(
-        [sys.executable, "-c", CHILD], capture_output=True, text=True, timeout=240, env=environment, cwd=ROOT
+        [sys.executable, "-c", CHILD, body], capture_output=True, text=True, timeout=240, env=environment, cwd=ROOT
     )
     assert run.returncode == 0, run.stderr[-2000:]
     crowd, refusal, refused, giant = run.stdout.splitlines()
