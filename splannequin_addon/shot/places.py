@@ -173,7 +173,7 @@ def _after_load(*_: object) -> None:
 
 
 @persistent
-def _after_import(context: Any, *_: object) -> None:
+def _after_import(context: bpy.types.BlendImportContext, *_: object) -> None:
     """Handler: relative paths of appended data started at the file that they come from."""
     for item in context.import_items:
         block = item.id
