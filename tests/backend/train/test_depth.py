@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 
 import cv2
@@ -49,6 +50,7 @@ def swaying(trained_copy):
     """The trained world, whose patch is painted as moving, with a lens in its solve."""
     lens = {"camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
     write_json(trained_copy.shot.solve_record, {"version": 1, **lens})
+    shutil.rmtree(trained_copy.shot.motion, ignore_errors=True)  # of another file's freeze, later than the run
     return trained_copy
 
 
