@@ -8,7 +8,9 @@ import shutil
 import subprocess
 import sys
 from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,8 +29,8 @@ from torch_backend.footage.color import linear_to_srgb
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take.plan import choose_t_star
-from torch_backend.live import _TINT, _TINTED, LiveSession, Superseded, _Waiting
-from torch_backend.shot import write_json
+from torch_backend.live import _TINT, _TINTED, LiveSession, Superseded, _Waiting, serve
+from torch_backend.shot import Shot, write_json
 from torch_backend.train import device
 from torch_backend.train.self_test import SelfTest
 
@@ -45,6 +47,12 @@ def session(trained):
     child.stdin.close()
     assert child.wait(20) == 0
     child.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def local(trained):
+    """A session in this process."""
+    return LiveSession(trained.shot, "main", "cpu")
 
 
 def start(shot, run="main"):
@@ -156,13 +164,12 @@ def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, traine
 
 
 @pytest.mark.parametrize("size", [(64, 48), (150, 60), (20, 30)])
-def test_view_of_any_size_uses_plates(trained, size):
-    session = LiveSession(trained.shot, "main", "cpu")
+def test_view_of_any_size_uses_plates(trained, local, size):
     width, height = size
     k = [width * 60 / 64, width * 60 / 64, 0.4 * width, 0.6 * height]
     request = {**view_of(trained, 105, 105, *size, exposed_like=105.0), "K": k}
     del request["kind"]
-    splats, plates = (picture(session.draw(LiveView(**request, detail=detail)))[0] for detail in (False, True))
+    splats, plates = (picture(local.draw(LiveView(**request, detail=detail)))[0] for detail in (False, True))
     assert plates.shape == (height, width, 4)
     covered = splats[..., 3] > 0.99
     # The same view: the splats are at the right place, but soft.
@@ -193,14 +200,13 @@ def test_plate_view_yields_to_a_newer_request_and_finishes_later(session, traine
     assert came.index(5) < max(came.index(1), came.index(4))
 
 
-def test_plate_view_is_interruptible_between_plates(trained):
-    session = LiveSession(trained.shot, "main", "cpu")
+def test_plate_view_is_interruptible_between_plates(trained, local):
     request = {k: v for k, v in view_of(trained, 105, 112, exposed_like=105.0).items() if k != "kind"}
     view = LiveView(**request, detail=True)
     turns = iter([False, False, True])
     with pytest.raises(Superseded):
-        session.draw(view, lambda: next(turns))
-    again, fresh = session.draw(view)[1], LiveSession(trained.shot, "main", "cpu").draw(view)[1]
+        local.draw(view, lambda: next(turns))
+    again, fresh = local.draw(view)[1], LiveSession(trained.shot, "main", "cpu").draw(view)[1]
     assert again == fresh, "what was given up leaves nothing behind"
     newer = dataclasses.replace(view, seq=9)
     waiting = _Waiting()
@@ -215,20 +221,24 @@ def test_plate_view_is_interruptible_between_plates(trained):
 
 
 def test_missing_footage_is_reported_and_splat_views_continue(trained, tmp_path):
-    shutil.copytree(trained.shot.root, tmp_path / "torn.splannequin")
-    child = start(tmp_path / "torn.splannequin")
-    try:
-        read_message(child.stdout)
-        for picture_file in (tmp_path / "torn.splannequin" / "frames").glob("*.png"):
-            picture_file.write_bytes(b"torn")
-        header, _ = ask(child, view_of(trained, 105, 108, detail=True))
+    torn = Shot(shutil.copytree(trained.shot.root, tmp_path / "torn.splannequin"))
+    session = LiveSession(torn, "main", "cpu")
+    for picture_file in torn.frames.glob("*.png"):
+        picture_file.write_bytes(b"torn")
+    with ThreadPoolExecutor(1) as pool:
+        pairs = (os.pipe(), os.pipe())
+        (requests, asked), (answered, answers) = ((os.fdopen(r, "rb"), os.fdopen(w, "wb")) for r, w in pairs)
+        served = pool.submit(serve, session, requests, answers)
+        pipes = SimpleNamespace(stdin=asked, stdout=answered)
+        read_message(answered)
+        header, _ = ask(pipes, view_of(trained, 105, 108, detail=True))
         assert (header["kind"], header["seq"]) == ("error", 7)
         assert "damaged" in header["message"] or "cannot be read" in header["message"]
-        picture(ask(child, view_of(trained, 105, 108)))
-    finally:
-        child.stdin.close()
-        assert child.wait(20) == 0
-        child.stdout.close()
+        picture(ask(pipes, view_of(trained, 105, 108)))
+        asked.close()
+        assert served.result() is None
+        for pipe in (requests, answers, answered):
+            pipe.close()
 
 
 def test_guesses_are_tinted_by_how_ill_they_were_seen(trained):
