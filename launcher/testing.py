@@ -30,7 +30,6 @@ NEWS_SECONDS = 60.0
 SECOND_HALF = (
     *(f"tests/backend/{name}" for name in ("cameras", "lens", "sfm", "motion", "raster", "footage", "card")),
     "tests/faults",
-    "tests/launcher",
 )
 """Folders with half of the backend's tests by duration: a separate leg in parallel to the other half. None of them
 needs the run that the other half trains once."""
