@@ -13,11 +13,12 @@ Rejected: `Frozen.Combined.R ...` (the same sockets, but no plain RGBA in other 
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
@@ -268,6 +269,20 @@ def channel_names(spec: oiio.ImageSpec) -> list[str]:
 _Facts = TypeVar("_Facts")
 
 
+@contextlib.contextmanager
+def _opened(path: Path) -> Generator[oiio.ImageInput]:
+    """An open EXR. Raises FileNotFoundError if there is no file, UserError if it cannot be read."""
+    if not path.is_file():
+        raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
+    image = oiio.ImageInput.open(regular_file(path))
+    if image is None:
+        raise UserError(f"{path}: cannot be read as EXR: {error_of()}")
+    try:
+        yield image
+    finally:
+        image.close()
+
+
 def read_layers(
     path: Path, channels: Sequence[str], what: str, metadata: Callable[[oiio.ImageSpec, Path], _Facts]
 ) -> tuple[oiio.ImageSpec, list[str], _Facts, NDArray[np.float32]]:
@@ -276,12 +291,7 @@ def read_layers(
     `what` is the message for a file without these channels ("not a frozen frame"). FileNotFoundError if there is no
     file; ValueError if it cannot be read or lacks a channel, or if `metadata` raises it.
     """
-    if not path.is_file():
-        raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
-    image = oiio.ImageInput.open(regular_file(path))
-    if image is None:
-        raise UserError(f"{path}: cannot be read as EXR: {error_of()}")
-    try:
+    with _opened(path) as image:
         spec = image.spec()
         names = channel_names(spec)
         missing = [name for name in channels if name not in names]
@@ -291,8 +301,6 @@ def read_layers(
         pixels = image.read_image(oiio.FLOAT)
         if pixels is None:
             raise UserError(f"{path}: damaged, {error_of(image)}")
-    finally:
-        image.close()
     return spec, names, facts, np.asarray(pixels, dtype=np.float32)
 
 
@@ -330,30 +338,17 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
 def read_metadata(path: str | Path) -> FrameMetadata:
     """Metadata of a file of `write_frozen_exr`, from its header. Raises as `read_frozen_exr`."""
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
-    image = oiio.ImageInput.open(regular_file(path))
-    if image is None:
-        raise UserError(f"{path}: cannot be read as EXR: {error_of()}")
-    try:
+    with _opened(path) as image:
         return _metadata(image.spec(), path)
-    finally:
-        image.close()
 
 
 def read_key(path: str | Path) -> str | None:
     """`FrameMetadata.key` of a file, from its header; None if the file cannot be read."""
     try:
-        image = oiio.ImageInput.open(regular_file(path))
+        with _opened(Path(path)) as image:
+            return str(image.spec().getattribute("splannequin:key") or "")
     except (OSError, ValueError):
         return None
-    if image is None:
-        oiio.geterror()  # clears the error, so that the next caller does not get it
-        return None
-    try:
-        return str(image.spec().getattribute("splannequin:key") or "")
-    finally:
-        image.close()
 
 
 def _in_primaries(name: str, layer: Rows, matrix: NDArray[np.float32] | None) -> Rows:
